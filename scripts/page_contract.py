@@ -127,7 +127,10 @@ def _constants() -> Iterator[str]:
         "ros_units": ROS_UNITS,
         "faults": {str(code): name for code, name in FAULTS.items()},
     }
-    yield f"export const FIELD_TABLE: FieldTable = {json.dumps(table, indent=2, ensure_ascii=False)};"
+    text = json.dumps(table, indent=2, ensure_ascii=False)
+    # A field a line.
+    text = re.sub(r'\{\s+"unit"[^{}]*\}', lambda field: " ".join(field[0].split()), text)
+    yield f"export const FIELD_TABLE: FieldTable = {text};"
     yield _FIELD_TABLE
 
 

@@ -77,263 +77,71 @@ export const FIELD_TABLE: FieldTable = {
   "version": 1,
   "stream": "vesc",
   "fields": {
-    "voltage_input": {
-      "unit": "V",
-      "meaning": "battery voltage at the controller",
-      "label": "Battery voltage"
-    },
-    "temperature_pcb": {
-      "unit": "degC",
-      "meaning": "temperature of the controller's board",
-      "label": "Board temperature"
-    },
-    "temp_fet": {
-      "unit": "degC",
-      "meaning": "temperature of the MOSFETs (driver may leave 0)"
-    },
-    "temp_motor": {
-      "unit": "degC",
-      "meaning": "temperature of the motor (driver may leave 0)"
-    },
-    "current_motor": {
-      "unit": "A",
-      "meaning": "motor current, negative while braking",
-      "label": "Motor current"
-    },
-    "current_input": {
-      "unit": "A",
-      "meaning": "battery current, negative while regenerating",
-      "label": "Battery current"
-    },
-    "avg_id": {
-      "unit": "A",
-      "meaning": "direct-axis current"
-    },
-    "avg_iq": {
-      "unit": "A",
-      "meaning": "quadrature-axis current"
-    },
-    "speed": {
-      "unit": "erpm",
-      "meaning": "electrical speed of the motor, revolutions per minute"
-    },
-    "duty_cycle": {
-      "unit": "1",
-      "meaning": "share of the battery voltage on the motor, -1 to 1"
-    },
-    "charge_drawn": {
-      "unit": "1e-4 Ah",
-      "meaning": "charge drawn since power-on",
-      "ros2_unit": "Ah"
-    },
-    "charge_regen": {
-      "unit": "1e-4 Ah",
-      "meaning": "charge recovered since power-on",
-      "ros2_unit": "Ah"
-    },
-    "energy_drawn": {
-      "unit": "1e-4 Wh",
-      "meaning": "energy drawn since power-on",
-      "ros2_unit": "Wh"
-    },
-    "energy_regen": {
-      "unit": "1e-4 Wh",
-      "meaning": "energy recovered since power-on",
-      "ros2_unit": "Wh"
-    },
-    "displacement": {
-      "unit": "counts",
-      "meaning": "tachometer, net"
-    },
-    "distance_traveled": {
-      "unit": "counts",
-      "meaning": "tachometer, absolute"
-    },
-    "fault_code": {
-      "unit": "enum",
-      "meaning": "0 none, otherwise see FAULTS"
-    },
-    "pid_pos_now": {
-      "unit": "deg",
-      "meaning": "rotor position of the position controller"
-    },
-    "controller_id": {
-      "unit": "id",
-      "meaning": "CAN id of the controller"
-    },
-    "ntc_temp_mos1": {
-      "unit": "degC",
-      "meaning": "temperature of MOSFET 1"
-    },
-    "ntc_temp_mos2": {
-      "unit": "degC",
-      "meaning": "temperature of MOSFET 2"
-    },
-    "ntc_temp_mos3": {
-      "unit": "degC",
-      "meaning": "temperature of MOSFET 3"
-    },
-    "avg_vd": {
-      "unit": "V",
-      "meaning": "direct-axis voltage"
-    },
-    "avg_vq": {
-      "unit": "V",
-      "meaning": "quadrature-axis voltage"
-    },
-    "broker_ms": {
-      "unit": "ms",
-      "meaning": "round trip over the path broker"
-    },
-    "rule_ms": {
-      "unit": "ms",
-      "meaning": "round trip over the path rule"
-    },
-    "lambda_ms": {
-      "unit": "ms",
-      "meaning": "round trip over the path lambda"
-    },
-    "cpu_percent": {
-      "unit": "%",
-      "meaning": "share of one core, since the sample before",
-      "label": "Processor"
-    },
-    "rss_mb": {
-      "unit": "MB",
-      "meaning": "memory in use",
-      "label": "Memory"
-    },
-    "samples_per_s": {
-      "unit": "samples/s",
-      "meaning": "samples from all sources, since the sample before"
-    },
-    "backlog_batches": {
-      "unit": "batches",
-      "meaning": "batches in the spool"
-    },
-    "backlog_bytes": {
-      "unit": "bytes",
-      "meaning": "bytes in the spool"
-    },
-    "dropped_batches": {
-      "unit": "batches",
-      "meaning": "batches dropped because the spool was full"
-    },
-    "connects": {
-      "unit": "connections",
-      "meaning": "connections made"
-    },
-    "clock_offset_ms": {
-      "unit": "ms",
-      "meaning": "cloud's clock minus the car's; null before the first pong"
-    },
-    "clock_uncertainty_ms": {
-      "unit": "ms",
-      "meaning": "uncertainty of the clock offset, either way"
-    },
-    "files_waiting": {
-      "unit": "files",
-      "meaning": "files waiting to be uploaded"
-    },
-    "files_sent_bytes": {
-      "unit": "bytes",
-      "meaning": "bytes of files sent",
-      "label": "Files sent"
-    },
-    "thread_errors": {
-      "unit": "errors",
-      "meaning": "errors of the agent's threads, since the sample before"
-    },
-    "speed_mps": {
-      "unit": "m/s",
-      "meaning": "speed of the car",
-      "label": "Speed"
-    },
-    "power_w": {
-      "unit": "W",
-      "meaning": "electrical power from the battery, negative while regenerating",
-      "label": "Battery power"
-    }
+    "voltage_input": { "unit": "V", "meaning": "battery voltage at the controller", "label": "Battery voltage" },
+    "temperature_pcb": { "unit": "degC", "meaning": "temperature of the controller's board", "label": "Board temperature" },
+    "temp_fet": { "unit": "degC", "meaning": "temperature of the MOSFETs (driver may leave 0)" },
+    "temp_motor": { "unit": "degC", "meaning": "temperature of the motor (driver may leave 0)" },
+    "current_motor": { "unit": "A", "meaning": "motor current, negative while braking", "label": "Motor current" },
+    "current_input": { "unit": "A", "meaning": "battery current, negative while regenerating", "label": "Battery current" },
+    "avg_id": { "unit": "A", "meaning": "direct-axis current" },
+    "avg_iq": { "unit": "A", "meaning": "quadrature-axis current" },
+    "speed": { "unit": "erpm", "meaning": "electrical speed of the motor, revolutions per minute" },
+    "duty_cycle": { "unit": "1", "meaning": "share of the battery voltage on the motor, -1 to 1" },
+    "charge_drawn": { "unit": "1e-4 Ah", "meaning": "charge drawn since power-on", "ros2_unit": "Ah" },
+    "charge_regen": { "unit": "1e-4 Ah", "meaning": "charge recovered since power-on", "ros2_unit": "Ah" },
+    "energy_drawn": { "unit": "1e-4 Wh", "meaning": "energy drawn since power-on", "ros2_unit": "Wh" },
+    "energy_regen": { "unit": "1e-4 Wh", "meaning": "energy recovered since power-on", "ros2_unit": "Wh" },
+    "displacement": { "unit": "counts", "meaning": "tachometer, net" },
+    "distance_traveled": { "unit": "counts", "meaning": "tachometer, absolute" },
+    "fault_code": { "unit": "enum", "meaning": "0 none, otherwise see FAULTS" },
+    "pid_pos_now": { "unit": "deg", "meaning": "rotor position of the position controller" },
+    "controller_id": { "unit": "id", "meaning": "CAN id of the controller" },
+    "ntc_temp_mos1": { "unit": "degC", "meaning": "temperature of MOSFET 1" },
+    "ntc_temp_mos2": { "unit": "degC", "meaning": "temperature of MOSFET 2" },
+    "ntc_temp_mos3": { "unit": "degC", "meaning": "temperature of MOSFET 3" },
+    "avg_vd": { "unit": "V", "meaning": "direct-axis voltage" },
+    "avg_vq": { "unit": "V", "meaning": "quadrature-axis voltage" },
+    "broker_ms": { "unit": "ms", "meaning": "round trip over the path broker" },
+    "rule_ms": { "unit": "ms", "meaning": "round trip over the path rule" },
+    "lambda_ms": { "unit": "ms", "meaning": "round trip over the path lambda" },
+    "cpu_percent": { "unit": "%", "meaning": "share of one core, since the sample before", "label": "Processor" },
+    "rss_mb": { "unit": "MB", "meaning": "memory in use", "label": "Memory" },
+    "samples_per_s": { "unit": "samples/s", "meaning": "samples from all sources, since the sample before" },
+    "backlog_batches": { "unit": "batches", "meaning": "batches in the spool" },
+    "backlog_bytes": { "unit": "bytes", "meaning": "bytes in the spool" },
+    "dropped_batches": { "unit": "batches", "meaning": "batches dropped because the spool was full" },
+    "connects": { "unit": "connections", "meaning": "connections made" },
+    "clock_offset_ms": { "unit": "ms", "meaning": "cloud's clock minus the car's; null before the first pong" },
+    "clock_uncertainty_ms": { "unit": "ms", "meaning": "uncertainty of the clock offset, either way" },
+    "files_waiting": { "unit": "files", "meaning": "files waiting to be uploaded" },
+    "files_sent_bytes": { "unit": "bytes", "meaning": "bytes of files sent", "label": "Files sent" },
+    "thread_errors": { "unit": "errors", "meaning": "errors of the agent's threads, since the sample before" },
+    "speed_mps": { "unit": "m/s", "meaning": "speed of the car", "label": "Speed" },
+    "power_w": { "unit": "W", "meaning": "electrical power from the battery, negative while regenerating", "label": "Battery power" }
   },
   "streams": {
     "pose": {
-      "x": {
-        "unit": "m",
-        "meaning": "position of the rear axle's middle"
-      },
-      "y": {
-        "unit": "m",
-        "meaning": "position of the rear axle's middle"
-      },
-      "heading": {
-        "unit": "rad",
-        "meaning": "direction of travel: 0 along x, pi/2 along y, -pi to pi"
-      }
+      "x": { "unit": "m", "meaning": "position of the rear axle's middle" },
+      "y": { "unit": "m", "meaning": "position of the rear axle's middle" },
+      "heading": { "unit": "rad", "meaning": "direction of travel: 0 along x, pi/2 along y, -pi to pi" }
     },
     "log": {
-      "level": {
-        "unit": "",
-        "meaning": "`warning`, `error` or `critical`"
-      },
-      "logger": {
-        "unit": "",
-        "meaning": "the part of the agent, such as `iort_agent.mqtt.aws`"
-      },
-      "text": {
-        "unit": "",
-        "meaning": "the line, with the exception's if it has one; at most 1,000 characters"
-      },
-      "left_out": {
-        "unit": "lines",
-        "meaning": "lines that were too many to send, since the line before"
-      }
+      "level": { "unit": "", "meaning": "`warning`, `error` or `critical`" },
+      "logger": { "unit": "", "meaning": "the part of the agent, such as `iort_agent.mqtt.aws`" },
+      "text": { "unit": "", "meaning": "the line, with the exception's if it has one; at most 1,000 characters" },
+      "left_out": { "unit": "lines", "meaning": "lines that were too many to send, since the line before" }
     },
     "drive": {
-      "session": {
-        "unit": "",
-        "meaning": "the operator's session that sent the command"
-      },
-      "by": {
-        "unit": "",
-        "meaning": "who sent it, as they say; null if they do not"
-      },
-      "seq": {
-        "unit": "",
-        "meaning": "the command's number in its session",
-        "label": "Command"
-      },
-      "sent_us": {
-        "unit": "us",
-        "meaning": "when it was sent, by the cloud's clock",
-        "label": "Sent at"
-      },
-      "outcome": {
-        "unit": "",
-        "meaning": "`accepted`, or why it was refused; `stopped` when the robot was stopped after it"
-      },
-      "driver": {
-        "unit": "",
-        "meaning": "the session that drives now; null if none does"
-      },
-      "driver_by": {
-        "unit": "",
-        "meaning": "who drives now"
-      },
-      "lease_left_ms": {
-        "unit": "ms",
-        "meaning": "how long the driver's lease still holds",
-        "label": "Lease left"
-      },
-      "speed": {
-        "unit": "m/s",
-        "meaning": "the speed that the robot was told; null if refused",
-        "label": "Speed asked for"
-      },
-      "steering": {
-        "unit": "rad",
-        "meaning": "the steering angle that it was told",
-        "label": "Steering asked for"
-      }
+      "session": { "unit": "", "meaning": "the operator's session that sent the command" },
+      "by": { "unit": "", "meaning": "who sent it, as they say; null if they do not" },
+      "seq": { "unit": "", "meaning": "the command's number in its session", "label": "Command" },
+      "sent_us": { "unit": "us", "meaning": "when it was sent, by the cloud's clock", "label": "Sent at" },
+      "outcome": { "unit": "", "meaning": "`accepted`, or why it was refused; `stopped` when the robot was stopped after it" },
+      "driver": { "unit": "", "meaning": "the session that drives now; null if none does" },
+      "driver_by": { "unit": "", "meaning": "who drives now" },
+      "lease_left_ms": { "unit": "ms", "meaning": "how long the driver's lease still holds", "label": "Lease left" },
+      "speed": { "unit": "m/s", "meaning": "the speed that the robot was told; null if refused", "label": "Speed asked for" },
+      "steering": { "unit": "rad", "meaning": "the steering angle that it was told", "label": "Steering asked for" }
     }
   },
   "ros_units": {

@@ -33,9 +33,63 @@ export function byId(id: string): HTMLElement {
   return node;
 }
 
+export function setText(node: Node, text: string): void {
+  if (node.textContent !== text) node.textContent = text;
+}
+
 export function setAttribute(node: Element, name: string, value: string): void {
   if (node.getAttribute(name) !== value) node.setAttribute(name, value);
 }
+
+/** A button that calls back when it is pressed. */
+export function button(text: string, pressed?: () => void, attributes: Attributes = {}): HTMLButtonElement {
+  const node = el("button", { type: "button", class: "tool", ...attributes }, text);
+  if (pressed) node.addEventListener("click", pressed);
+  return node;
+}
+
+/** A framed part of the page with a heading, and what stands beside that. */
+export function panel(
+  title: string,
+  name: string,
+  beside: readonly (Node | string)[],
+  ...children: (Node | string)[]
+): HTMLElement {
+  const header = el("header", {}, el("h3", {}, title), ...beside);
+  return el("section", { class: `panel ${name}`.trim(), "aria-label": title }, header, ...children);
+}
+
+export function table(head: readonly string[], body: HTMLElement): HTMLElement {
+  const cells = head.map((text) => el("th", { scope: "col" }, text));
+  return el("table", {}, el("thead", {}, el("tr", {}, ...cells)), body);
+}
+
+/** The choices of a list: each value with its label, or values that are their own. */
+export function choices(
+  of: readonly string[] | readonly (readonly [value: string, label: string])[],
+): Node[] {
+  return of.map((each) => {
+    const [value, label] = typeof each === "string" ? [each, each] : each;
+    return el("option", { value }, label);
+  });
+}
+
+/** A form that calls back instead of leaving the page. */
+export function form(
+  attributes: Attributes,
+  submitted: () => void,
+  ...children: (Node | string)[]
+): HTMLFormElement {
+  const node = el("form", attributes, ...children);
+  node.addEventListener("submit", (event) => {
+    event.preventDefault();
+    submitted();
+  });
+  return node;
+}
+
+/** What a view is without the page's server. */
+export const unserved = (text: string): HTMLElement => el("p", { class: "unserved" }, ...marked(text));
 
 /** A text with its `code`. */
 export function marked(text: string): (HTMLElement | string)[] {
@@ -51,3 +105,9 @@ export function onPress(button: HTMLElement, pressed: () => void): void {
 
 /** Natural order: car-2 before car-10. */
 export const byName = new Intl.Collator("en", { numeric: true }).compare;
+
+/** A name for what lives no longer than this page. */
+export const newName = (): string =>
+  Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16).padStart(2, "0")).join(
+    "",
+  );

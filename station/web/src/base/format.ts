@@ -11,6 +11,9 @@ export interface Linear {
 export const AS_SENT: Linear = { scale: 1, shift: 0 };
 export const times = (scale: number): Linear => ({ scale, shift: 0 });
 export const linear = (value: number, { scale, shift }: Linear): number => value * scale + shift;
+/** A column's numbers as they are shown; what is none is null. */
+export const numbers = (values: readonly Value[], as: Linear): (number | null)[] =>
+  values.map((value) => (typeof value === "number" ? linear(value, as) : null));
 
 export interface Spec extends Linear {
   readonly label: string;
@@ -25,45 +28,25 @@ export interface Spec extends Linear {
 
 export const NOTHING = "–";
 
-const DIGITS: Readonly<Record<string, number>> = {
-  V: 2,
-  A: 2,
-  degC: 1,
-  erpm: 0,
-  deg: 1,
-  counts: 0,
-  Ah: 4,
-  Wh: 3,
-  id: 0,
-  "m/s": 2,
-  W: 1,
-  ms: 0,
-  "%": 1,
-  "m/s^2": 2,
-  "rad/s": 2,
-  m: 2,
-  rad: 3,
-  MB: 1,
-  batches: 0,
-  bytes: 0,
-};
+// The units by their digits after the point: none, one, and so on.
+const UNITS_OF_DIGITS = [
+  ["erpm", "counts", "id", "ms", "batches", "bytes"],
+  ["degC", "deg", "W", "%", "MB"],
+  ["V", "A", "m/s", "m/s^2", "rad/s", "m"],
+  ["Wh", "rad"],
+  ["Ah"],
+];
+const DIGITS: Readonly<Record<string, number>> = Object.fromEntries(
+  UNITS_OF_DIGITS.flatMap((units, digits) => units.map((unit) => [unit, digits])),
+);
 const UNITS: Readonly<Record<string, string>> = { degC: "°C", deg: "°", enum: "", id: "", "m/s^2": "m/s²" };
-const CAPITALS = new Set([
-  "pcb",
-  "fet",
-  "ntc",
-  "pid",
-  "id",
-  "iq",
-  "vd",
-  "vq",
-  "imu",
-  "gps",
-  "cpu",
-  "mos1",
-  "mos2",
-  "mos3",
-]);
+const CAPITALS = new Set("pcb fet ntc pid id iq vd vq imu gps cpu mos1 mos2 mos3".split(" "));
+
+/** The paths of positions in geometry_msgs, nav_msgs and tf2_msgs, and in flat messages. */
+export const POSITIONS =
+  "pose.pose.position. pose.position. position. transform.translation. translation. pose."
+    .split(" ")
+    .concat("");
 
 /** The format of a field of a stream; `ros2` selects the ROS 2 driver's units. */
 export function spec(field: string, table: FieldTable, ros2 = false, stream = ""): Spec {

@@ -1,5 +1,7 @@
 // Ranges of time, and how an address writes them: 2026-05-04T10:00:00.000Z.
 
+import type { Extent } from "./contract";
+
 export type Range = readonly [from_s: number, to_s: number];
 
 /** The shortest range that can be shown. */
@@ -31,3 +33,11 @@ export const rounded = ([from, to]: Range): Range => [
   Math.floor(from * 1000) / 1000,
   Math.ceil(to * 1000) / 1000,
 ];
+
+/** The ends as the server's questions have them. */
+export const inUs = ([from, to]: Range): { readonly from_us: string; readonly to_us: string } => ({
+  from_us: String(Math.round(from * 1e6)),
+  to_us: String(Math.round(to * 1e6)),
+});
+
+export const rangeOf = ({ from_us, to_us }: Extent): Range => rounded([from_us / 1e6, to_us / 1e6]);

@@ -69,9 +69,8 @@ export function readRoute(hash: string): Route {
     return { view: name, robot, query: read(name) };
   if (name === "insights")
     return { view: name, ...(robot === undefined ? {} : { robot }), query: read(name) };
-  if (name === "cloudwatch") return { view: name, query: read(name) };
-  if (name === "alarms") return { view: name, query: read(name) };
-  if (name === "compare") return { view: name, query: read(name) };
+  if (name === "cloudwatch" || name === "alarms" || name === "compare")
+    return { view: name, query: read(name) };
   return { view: "fleet", query: read("fleet") };
 }
 
@@ -138,4 +137,23 @@ export function readParts(text = ""): Part[] {
     const range = readRange(from, to);
     return NAME.test(robot) && range ? [{ robot, range }] : [];
   });
+}
+
+/** Make a link to a comparison of these parts, or say why there is none. */
+export function offerComparison(
+  link: HTMLAnchorElement,
+  parts: readonly Part[],
+  what: string,
+  text: string,
+  query: Query<"compare">,
+): void {
+  const few =
+    parts.length < 2
+      ? `Check two ${what} to compare them`
+      : parts.length > MOST_PARTS
+        ? `At most ${MOST_PARTS} ${what} can be compared`
+        : "";
+  link.textContent = few || text;
+  if (few) link.removeAttribute("href");
+  else link.href = route({ view: "compare", query: { runs: writeParts(parts), ...query } });
 }

@@ -1,11 +1,12 @@
 // The warnings and errors of a car's agent: those that come live, and those of the last hour from the page's server.
 
-import { type Config, type HistoryAnswer, LOG_STREAM, type StreamsAnswer } from "../base/contract";
-import { el, Text } from "../base/dom";
+import { type Config, type HistoryAnswer, LOG_STREAM } from "../base/contract";
+import { el, panel, Text } from "../base/dom";
 import { when } from "../base/format";
+import { inUs } from "../base/range";
 import { type Line, lineOf } from "../live/lines";
 import type { Robot } from "../live/robot";
-import { AnswerError, ask } from "../server/answers";
+import { ask, Latest } from "../server/answers";
 
 const BACK_S = 3600;
 // More than an agent sends in an hour: a row of several lines would have the last one alone.
@@ -13,21 +14,15 @@ const ROWS = 3000;
 const SHOWN = 100;
 
 export class AgentLog {
-  readonly node: HTMLElement;
   private readonly note = new Text("note", "p");
   private readonly list = el("ol", { class: "lines" });
+  readonly node = panel("Agent's log", "agent-log", [this.note.node], this.list);
+  private readonly finding = new Latest();
   private past: readonly Line[] = [];
   private robot: string | undefined;
   private drawn = "";
 
-  constructor(private readonly config: Config) {
-    this.node = el(
-      "section",
-      { class: "panel agent-log", "aria-label": "Agent's log" },
-      el("header", {}, el("h3", {}, "Agent's log"), this.note.node),
-      this.list,
-    );
-  }
+  constructor(private readonly config: Config) {}
 
   /** Show this car's lines from now on. */
   of(robot: string): void {
@@ -54,27 +49,18 @@ export class AgentLog {
 
   private async find(robot: string): Promise<void> {
     // Not a microsecond over an hour: longer ranges are answered from the summaries, which have no texts.
-    const to_us = Date.now() * 1000;
-    const asked = {
-      robot,
-      stream: LOG_STREAM,
-      from_us: String(to_us - BACK_S * 1e6),
-      to_us: String(to_us),
-      rows: String(ROWS),
-    };
-    try {
-      // A car that never warned has no such stream.
-      const { streams } = await ask<StreamsAnswer>("streams", { robot });
-      if (!streams.includes(LOG_STREAM)) return;
-      const { times_s, fields } = await ask<HistoryAnswer>("history", asked);
-      if (robot !== this.robot) return;
-      this.past = times_s.flatMap(
-        (at, i) => lineOf(Math.round(at * 1e6), (name) => fields[name]?.mean[i]) ?? [],
-      );
-    } catch (error) {
-      // What comes live is shown all the same.
-      if (!(error instanceof AnswerError)) throw error;
-    }
+    const now = Date.now() / 1000;
+    const asked = { robot, stream: LOG_STREAM, ...inUs([now - BACK_S, now]), rows: String(ROWS) };
+    await this.finding.run(
+      async (signal) => {
+        const { times_s, fields } = await ask<HistoryAnswer>("history", asked, signal);
+        this.past = times_s.flatMap(
+          (at, i) => lineOf(Math.round(at * 1e6), (name) => fields[name]?.mean[i]) ?? [],
+        );
+      },
+      // What comes live is shown all the same; a car that never warned has no such stream.
+      () => undefined,
+    );
   }
 }
 

@@ -1,7 +1,7 @@
 // A car's charts, which the viewer chooses and arranges: drag a chart by its grip, or move it with the arrow keys.
 
 import type { FieldTable, TrackMap } from "../base/contract";
-import { el } from "../base/dom";
+import { button, el } from "../base/dom";
 import type { Linear } from "../base/format";
 import { WINDOWS } from "../charts/windows";
 import type { Robot } from "../live/robot";
@@ -32,14 +32,14 @@ export class Board {
 
   /** Show these charts, in this order. */
   set(keys: readonly string[]): void {
-    const wanted = [...new Set(keys)].slice(0, MOST);
+    const chosen = [...new Set(keys)].slice(0, MOST);
     for (const [key, panel] of this.panels) {
-      if (wanted.includes(key)) continue;
+      if (chosen.includes(key)) continue;
       panel.node.remove();
       panel.destroy();
       this.panels.delete(key);
     }
-    this.order = wanted.filter((key) => this.panels.has(key) || this.add(key));
+    this.order = chosen.filter((key) => this.panels.has(key) || this.add(key));
     this.node.append(...this.order.map((key) => this.panels.get(key)!.node));
   }
 
@@ -70,18 +70,15 @@ export class Board {
     const panel = panelOf(key, this.table, this.track);
     if (!panel) return false;
     panel.span(this.window_s);
-    const grip = el(
-      "button",
-      {
-        type: "button",
-        class: "grip",
-        "aria-label": `Move ${panel.title}`,
-        title: "Drag, or press the arrow keys",
-      },
-      "\u283f",
-    );
-    const close = el("button", { type: "button", class: "close", "aria-label": `Close ${panel.title}` }, "×");
-    close.addEventListener("click", () => this.toggle(key));
+    const grip = button("\u283f", undefined, {
+      class: "grip",
+      "aria-label": `Move ${panel.title}`,
+      title: "Drag, or press the arrow keys",
+    });
+    const close = button("×", () => this.toggle(key), {
+      class: "close",
+      "aria-label": `Close ${panel.title}`,
+    });
     grip.addEventListener("keydown", (event) => this.step(event, key));
     grip.addEventListener("pointerdown", (event) => grip.setPointerCapture(event.pointerId));
     grip.addEventListener(

@@ -1,14 +1,14 @@
 // What a car's board is made of: each panel finds its values in the car, and is hidden while the car has none.
 
 import type { FieldTable, TrackMap } from "../base/contract";
-import { el } from "../base/dom";
+import { el, panel } from "../base/dom";
 import { AS_SENT, type Linear, linear, spec } from "../base/format";
 import { ChartPanel } from "../charts/chart_panel";
 import { WINDOWS, windowLabel } from "../charts/windows";
 import { type Track, XYChart } from "../charts/xy_chart";
 import type { Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
-import { BOARD, type DelaySpec, type LineSpec, type XYChartSpec } from "./car_charts";
+import { BOARD, type LineSpec, type XYChartSpec } from "./car_charts";
 import { edges } from "./track_map";
 
 const MOST_POINTS = 4000;
@@ -38,70 +38,33 @@ export function panelOf(key: string, table: FieldTable, track: TrackMap | null):
   return stream && field && rest.length === 0 ? new FieldPanel(stream, field, table) : undefined;
 }
 
-abstract class TimePanel implements BoardPanel {
-  readonly title: string;
-  readonly node: HTMLElement;
-
-  constructor(
-    protected readonly panel: ChartPanel,
-    title: string,
-  ) {
-    this.title = title;
-    this.node = panel.node;
-  }
-
-  abstract values(robot: Robot, speed: Linear | undefined): boolean;
-
-  due(now: number): boolean {
-    return this.panel.due(now);
-  }
-
-  draw(now: number): void {
-    this.panel.draw(now);
-  }
-
-  span(window_s: number): void {
-    this.panel.span(window_s);
-  }
-
-  destroy(): void {
-    this.panel.destroy();
-  }
-}
-
-class LinePanel extends TimePanel {
+class LinePanel extends ChartPanel implements BoardPanel {
   constructor(
     private readonly spec: LineSpec,
     private readonly table: FieldTable,
   ) {
-    super(new ChartPanel(spec), spec.title);
+    super(spec);
   }
 
   values(robot: Robot, speed: Linear | undefined): boolean {
     const { fields, as } = this.spec;
     const vesc = robot.vesc(this.table);
-    this.panel.show(
-      vesc && { history: vesc.history, columns: fields.map((field) => vesc.columns.get(field)) },
-      ...as(speed),
-    );
-    this.panel.update(fields.map((field) => numeric(vesc?.sample.get(field))));
+    const columns = fields.map((field) => vesc?.columns.get(field));
+    this.show(vesc && { history: vesc.history, columns }, ...as(speed));
+    this.update(fields.map((field) => numeric(vesc?.sample.get(field))));
     return vesc !== undefined;
   }
 }
 
-class DelayPanel extends TimePanel {
-  constructor(spec: DelaySpec) {
-    super(new ChartPanel(spec), spec.title);
-  }
-
+class DelayPanel extends ChartPanel implements BoardPanel {
   values(robot: Robot): boolean {
-    this.panel.show({ history: robot.delays, columns: [1] }, AS_SENT);
-    this.panel.update([robot.newestDelay()?.total ?? NaN]);
+    this.show({ history: robot.delays, columns: [1] }, AS_SENT);
+    this.update([robot.newestDelay()?.total ?? NaN]);
     return true;
   }
 }
 
-class FieldPanel extends TimePanel {
+class FieldPanel extends ChartPanel implements BoardPanel {
   constructor(
     private readonly stream: string,
     private readonly field: string,
@@ -114,27 +77,25 @@ class FieldPanel extends TimePanel {
       from: ([value = NaN]: readonly number[]) => value,
       ...(digits === undefined ? {} : { digits }),
     };
-    super(
-      new ChartPanel({
-        title: label,
-        readings: [reading],
-        chart: { lines: [{ colour: "--accent" }], span: 1e-3 },
-      }),
-      label,
-    );
+    super({ title: label, readings: [reading], chart: { lines: [{ colour: "--accent" }], span: 1e-3 } });
   }
 
   values(robot: Robot): boolean {
     const stream = robot.streams.get(this.stream);
     const as = spec(this.field, this.table, stream?.ros2, this.stream);
-    this.panel.show(
-      stream && { history: stream.history, columns: [stream.columns.get(this.field)] },
-      as,
-      as.unit,
-    );
-    this.panel.update([numeric(stream?.sample.get(this.field))]);
+    const shown = stream && { history: stream.history, columns: [stream.columns.get(this.field)] };
+    this.show(shown, as, as.unit);
+    this.update([numeric(stream?.sample.get(this.field))]);
     return stream?.columns.has(this.field) ?? false;
   }
+}
+
+/** Two fields of a stream, and the scale of the first. */
+interface Source {
+  readonly stream: Stream;
+  readonly x: string;
+  readonly y: string;
+  readonly as: Linear;
 }
 
 class XYPanel implements BoardPanel {
@@ -142,9 +103,7 @@ class XYPanel implements BoardPanel {
   readonly node: HTMLElement;
   private readonly chart: XYChart;
   private readonly note = el("p", { class: "note" });
-  private source:
-    | { readonly stream: Stream; readonly x: string; readonly y: string; readonly as: Linear }
-    | undefined;
+  private source: Source | undefined;
   private unit = "";
   private window_s = 0;
 
@@ -154,12 +113,7 @@ class XYPanel implements BoardPanel {
   ) {
     const host = el("div", { class: "plot" });
     this.title = spec.title;
-    this.node = el(
-      "section",
-      { class: "panel xy", "aria-label": spec.title },
-      el("header", {}, el("h3", {}, spec.title), this.note),
-      host,
-    );
+    this.node = panel(spec.title, "xy", [this.note], host);
     this.chart = new XYChart(host, {
       ...spec,
       x: () => spec.x + this.unit,
@@ -199,7 +153,7 @@ class XYPanel implements BoardPanel {
   }
 }
 
-function track({ stream, x, y, as }: NonNullable<XYPanel["source"]>, from: number): Track {
+function track({ stream, x, y, as }: Source, from: number): Track {
   const column = (field: string): Float64Array => stream.history.column(stream.columns.get(field)!, from);
   const [across, up] = [column(x), column(y)];
   // A long window has more points than the chart has pixels.

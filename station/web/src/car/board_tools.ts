@@ -1,7 +1,7 @@
 // What is chosen for a car's charts: window and charts, kept in this browser and in the address.
 
 import type { FieldTable } from "../base/contract";
-import { el } from "../base/dom";
+import { button, choices, el, form } from "../base/dom";
 import { spec } from "../base/format";
 import { keep, kept } from "../base/kept";
 import type { Query } from "../base/route";
@@ -19,12 +19,10 @@ export class BoardTools {
   private readonly window = el(
     "select",
     { name: "window" },
-    ...[...WINDOWS]
-      .sort((a, b) => a - b)
-      .map((each) => el("option", { value: String(each) }, windowLabel(each))),
+    ...choices([...WINDOWS].sort((a, b) => a - b).map((each) => [String(each), windowLabel(each)] as const)),
   );
   private readonly more = el("select", { name: "chart", "aria-label": "Add a chart" });
-  private readonly reset = el("button", { type: "button", class: "tool" }, "Reset");
+  private readonly reset = button("Reset", () => this.choose(WINDOWS[0], EVERY));
   private charts = EVERY;
   private robot: Robot | undefined;
 
@@ -33,19 +31,12 @@ export class BoardTools {
     private readonly table: FieldTable,
     private readonly changed: () => void,
   ) {
-    this.node = el(
-      "form",
-      { class: "range board-tools" },
-      el("label", {}, "Last ", this.window),
-      this.more,
-      this.reset,
-    );
-    this.node.addEventListener("submit", (event) => event.preventDefault());
+    const last = el("label", {}, "Last ", this.window);
+    this.node = form({ class: "range board-tools" }, () => undefined, last, this.more, this.reset);
     this.window.addEventListener("input", () => this.choose(Number(this.window.value), this.charts));
     this.more.addEventListener("input", () => board.toggle(this.more.value));
     // Made when it is needed: a car may have hundreds of fields, and new ones at any time.
     for (const event of ["pointerdown", "focus"]) this.more.addEventListener(event, () => this.offer());
-    this.reset.addEventListener("click", () => this.choose(WINDOWS[0], EVERY));
     this.offer();
   }
 
@@ -89,27 +80,21 @@ export class BoardTools {
   /** Offer the charts that are not shown, and the numbers of every stream. */
   private offer(): void {
     const shown = new Set(this.board.charts);
-    const option = (value: string, text: string): HTMLElement[] =>
-      shown.has(value) ? [] : [el("option", { value }, text)];
-    const group = (label: string, options: HTMLElement[]): HTMLElement[] =>
-      options.length > 0 ? [el("optgroup", { label }, ...options)] : [];
+    const group = (label: string, of: readonly (readonly [value: string, text: string])[]): HTMLElement[] => {
+      const others = of.filter(([value]) => !shown.has(value));
+      return others.length > 0 ? [el("optgroup", { label }, ...choices(others))] : [];
+    };
     const streams = [...(this.robot?.streams.values() ?? [])];
     const first = el("option", { value: "", selected: "", disabled: "", hidden: "" }, "Add a chart");
-    this.more.replaceChildren(
-      first,
-      ...group(
-        "Charts",
-        [...BOARD].flatMap(([key, { title }]) => option(key, title)),
-      ),
-      ...streams.flatMap(({ name, columns, ros2 }) =>
-        group(
-          name,
-          [...columns.keys()].flatMap((field) =>
-            option(fieldKey(name, field), spec(field, this.table, ros2, name).label),
-          ),
-        ),
-      ),
-    );
+    const charts = [...BOARD].map(([key, { title }]) => [key, title] as const);
+    const fields = streams.flatMap(({ name, columns, ros2 }) => {
+      const label = (field: string): string => spec(field, this.table, ros2, name).label;
+      return group(
+        name,
+        [...columns.keys()].map((field) => [fieldKey(name, field), label(field)] as const),
+      );
+    });
+    this.more.replaceChildren(first, ...group("Charts", charts), ...fields);
     first.selected = true;
   }
 }

@@ -1,7 +1,7 @@
-// The charts of a car's view. To add one, add an entry to `CHARTS`.
+// The gauges and charts of a car's view. To add one, add an entry to `GAUGES` or `CHARTS`.
 
 import { power_w } from "../base/contract";
-import { AS_SENT, type Linear, linear, times } from "../base/format";
+import { AS_SENT, type Linear, linear, POSITIONS, times } from "../base/format";
 import type { ChartPanelOptions } from "../charts/chart_panel";
 import type { GaugeOptions } from "../charts/gauge";
 import type { XYChartOptions } from "../charts/xy_chart";
@@ -9,7 +9,6 @@ import { hottest, type Robot } from "../live/robot";
 
 /** A number with a bar. */
 export interface GaugeSpec extends GaugeOptions {
-  readonly kind: "gauge";
   /** The fields that need no tile because of this gauge. */
   readonly fields: readonly string[];
   /** The field whose minimum and maximum of the last 30 s are shown. */
@@ -53,105 +52,51 @@ export interface DelaySpec extends ChartPanelOptions {
   readonly key: string;
 }
 
-const plain = (field: string, scale = 1): Pick<GaugeSpec, "fields" | "extent" | "show"> => ({
+const first = ([value = NaN]: readonly number[]): number => value;
+const asSent = (): readonly [Linear] => [AS_SENT];
+
+/** A gauge of one field. */
+const ofField = (field: string, scale = 1): Pick<GaugeSpec, "fields" | "extent" | "show"> => ({
   fields: [field],
   extent: field,
   show: (newest) => ({ value: newest(field) * scale, as: times(scale) }),
 });
 
-const first = ([value = NaN]: readonly number[]): number => value;
-const asSent = (): readonly [Linear] => [AS_SENT];
+const gauge = (
+  name: string,
+  label: string,
+  [unit, digits]: readonly [string, number],
+  [from, to]: readonly [number, number],
+  more: Pick<GaugeSpec, "fields" | "extent" | "show">,
+): GaugeSpec => ({ name, label, unit, digits, from, to, ...more });
 
-// The paths of positions in geometry_msgs, nav_msgs and tf2_msgs, and in flat messages.
-const POSITIONS = [
-  "pose.pose.position.",
-  "pose.position.",
-  "position.",
-  "transform.translation.",
-  "translation.",
-  "pose.",
-  "",
-];
-
-const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
-  {
-    kind: "gauge",
-    name: "speed_mps",
-    label: "Speed",
-    unit: "m/s",
-    digits: 2,
-    from: 0,
-    to: 4,
+export const GAUGES: readonly GaugeSpec[] = [
+  gauge("speed_mps", "Speed", ["m/s", 2], [0, 4], {
     fields: [],
     extent: "speed",
     show: (newest, _, speed) =>
       speed
         ? { value: linear(newest("speed"), speed), as: speed }
         : { value: newest("speed"), unit: "erpm", digits: 0 },
-  },
-  {
-    kind: "gauge",
-    name: "voltage_input",
-    label: "Battery",
-    unit: "V",
-    digits: 2,
-    from: 9,
-    to: 13,
-    ...plain("voltage_input"),
-  },
-  {
-    kind: "gauge",
-    name: "temperature",
-    label: "Temperature, hottest",
-    unit: "°C",
-    digits: 1,
-    from: 0,
-    to: 100,
+  }),
+  gauge("voltage_input", "Battery", ["V", 2], [9, 13], ofField("voltage_input")),
+  gauge("temperature", "Temperature, hottest", ["°C", 1], [0, 100], {
     fields: [],
     show: (newest) => ({ value: hottest(newest) }),
-  },
-  {
-    kind: "gauge",
-    name: "current_motor",
-    label: "Motor current",
-    unit: "A",
-    digits: 2,
-    from: -20,
-    to: 40,
-    ...plain("current_motor"),
-  },
-  {
-    kind: "gauge",
-    name: "power_w",
-    label: "Battery power",
-    unit: "W",
-    digits: 1,
-    from: -100,
-    to: 200,
+  }),
+  gauge("current_motor", "Motor current", ["A", 2], [-20, 40], ofField("current_motor")),
+  gauge("power_w", "Battery power", ["W", 1], [-100, 200], {
     fields: [],
     show: (newest) => ({ value: power_w(newest("voltage_input"), newest("current_input")) }),
-  },
-  {
-    kind: "gauge",
-    name: "duty_cycle",
-    label: "Duty cycle",
-    unit: "%",
-    digits: 1,
-    from: -20,
-    to: 100,
-    ...plain("duty_cycle", 100),
-  },
-  {
-    kind: "gauge",
-    name: "delay",
-    label: "Delay of the newest message",
-    unit: "ms",
-    digits: 0,
-    from: 0,
-    to: 100,
+  }),
+  gauge("duty_cycle", "Duty cycle", ["%", 1], [-20, 100], ofField("duty_cycle", 100)),
+  gauge("delay", "Delay of the newest message", ["ms", 0], [0, 100], {
     fields: [],
     show: (_, robot) => ({ value: robot.newestDelay()?.total ?? NaN }),
-  },
+  }),
+];
+
+const CHARTS: readonly (LineSpec | XYChartSpec)[] = [
   {
     kind: "line",
     key: "speed",
@@ -250,8 +195,7 @@ const DELAY: DelaySpec = {
   chart: { lines: [{ colour: "--delay", fill: true }], span: 20, zero: true },
 };
 
-export const GAUGES = CHARTS.filter((chart) => chart.kind === "gauge");
 /** The charts that are shown unless the viewer chooses, by their keys and in their order. */
 export const BOARD: ReadonlyMap<string, LineSpec | XYChartSpec | DelaySpec> = new Map(
-  [...CHARTS.filter((chart) => chart.kind !== "gauge"), DELAY].map((chart) => [chart.key, chart]),
+  [...CHARTS, DELAY].map((chart) => [chart.key, chart]),
 );

@@ -1,10 +1,10 @@
 // One command to a car, and the car's answer. The page's server sends it as `iort send` does.
 
 import { MAX_LEASE_MS, type SendAnswer } from "../base/contract";
-import { el } from "../base/dom";
+import { button, choices, el, form } from "../base/dom";
 import { age } from "../base/format";
 import { keep, kept } from "../base/kept";
-import { AnswerError, act } from "../server/answers";
+import { act, words } from "../server/answers";
 
 type Message = Readonly<Record<string, unknown>>;
 
@@ -29,6 +29,7 @@ const MESSAGES: Readonly<
 };
 const FIRST = "AckermannDriveStamped";
 const LEASE_MS = 500;
+const NUMBER = { type: "number" };
 
 export class Commands {
   readonly node: HTMLElement;
@@ -39,29 +40,13 @@ export class Commands {
     pattern: "[A-Za-z0-9_\\-]{1,64}",
     autocomplete: "off",
   });
-  private readonly type = el(
-    "select",
-    { name: "type" },
-    ...[...Object.keys(MESSAGES), "JSON"].map((value) => el("option", { value }, value)),
-  );
-  private readonly speed = el("input", {
-    type: "number",
-    name: "speed",
-    value: "0.5",
-    step: "0.1",
-    required: "",
-  });
-  private readonly turn = el("input", {
-    type: "number",
-    name: "turn",
-    value: "0",
-    step: "0.05",
-    required: "",
-  });
+  private readonly type = el("select", { name: "type" }, ...choices([...Object.keys(MESSAGES), "JSON"]));
+  private readonly speed = el("input", { ...NUMBER, name: "speed", value: "0.5", step: "0.1", required: "" });
+  private readonly turn = el("input", { ...NUMBER, name: "turn", value: "0", step: "0.05", required: "" });
   private readonly turnLabel = el("span");
   private readonly turnUnit = el("span", { class: "unit" });
   private readonly lease = el("input", {
-    type: "number",
+    ...NUMBER,
     name: "lease",
     value: String(LEASE_MS),
     min: "1",
@@ -74,7 +59,11 @@ export class Commands {
     "{}",
   );
   private readonly drive: HTMLElement;
-  private readonly stop = el("button", { type: "button", class: "tool stop" }, "Stop");
+  private readonly stop = button(
+    "Stop",
+    () => void this.send(MESSAGES[this.type.value]!.of(0, 0), String(LEASE_MS)),
+    { class: "tool stop" },
+  );
   private readonly said = el("p", { class: "note said", role: "status" });
   private robot = "";
   private sending = 0;
@@ -82,57 +71,25 @@ export class Commands {
   constructor() {
     const known = kept("car.message") ?? FIRST;
     this.type.value = Object.hasOwn(MESSAGES, known) || known === "JSON" ? known : FIRST;
-    this.drive = el(
-      "div",
-      { class: "pair" },
-      el("label", {}, "Speed", this.speed, el("span", { class: "unit" }, "m/s")),
+    const pair = (...fields: Node[]): HTMLElement => el("div", { class: "pair" }, ...fields);
+    const unit = (text: string): HTMLElement => el("span", { class: "unit" }, text);
+    this.drive = pair(
+      el("label", {}, "Speed", this.speed, unit("m/s")),
       el("label", {}, this.turnLabel, this.turn, this.turnUnit),
     );
-    const form = el(
-      "form",
+    const body = form(
       { class: "control" },
-      el(
-        "div",
-        { class: "pair" },
-        el("label", {}, "Command", this.command),
-        el("label", {}, "Message", this.type),
-      ),
+      () => this.submit(),
+      pair(el("label", {}, "Command", this.command), el("label", {}, "Message", this.type)),
       this.drive,
       this.json,
-      el(
-        "div",
-        { class: "pair" },
-        el(
-          "label",
-          { title: "How long the car may move, from now" },
-          "For",
-          this.lease,
-          el("span", { class: "unit" }, "ms"),
-        ),
-      ),
-      el(
-        "div",
-        { class: "pair" },
-        el("button", { type: "submit", class: "tool primary" }, "Send"),
-        this.stop,
-      ),
+      pair(el("label", { title: "How long the car may move, from now" }, "For", this.lease, unit("ms"))),
+      pair(el("button", { type: "submit", class: "tool primary" }, "Send"), this.stop),
       this.said,
     );
-    form.addEventListener("submit", (event) => {
-      event.preventDefault();
-      this.submit();
-    });
-    this.stop.addEventListener(
-      "click",
-      () => void this.send(MESSAGES[this.type.value]!.of(0, 0), String(LEASE_MS)),
-    );
     this.type.addEventListener("input", () => this.shape());
-    this.node = el(
-      "details",
-      { class: "panel control-panel" },
-      el("summary", {}, el("h3", {}, "Commands")),
-      form,
-    );
+    const title = el("summary", {}, el("h3", {}, "Commands"));
+    this.node = el("details", { class: "panel control-panel" }, title, body);
     this.shape();
   }
 
@@ -170,32 +127,33 @@ export class Commands {
     keep("car.message", this.type.value);
     const sending = (this.sending += 1);
     this.say("", `Waiting for ${robot} …`);
-    let told: readonly [string, string];
-    try {
-      const { accepted, reason, after_ms } = await act<SendAnswer>("send", {
-        robot,
-        command,
-        message: JSON.stringify(message),
-        lease_ms,
-      });
-      if (accepted) told = ["good", `${command} accepted after ${age(after_ms / 1000)}`];
-      else if (accepted === false) told = ["bad", `${command} rejected: ${reason.replaceAll("_", " ")}`];
-      else if (reason) told = ["bad", reason];
-      else
-        told = [
-          "bad",
-          `No answer within ${age(after_ms / 1000)}. Does its agent run, and has its car.yaml downlink.cmd.${command}?`,
-        ];
-    } catch (error) {
-      if (!(error instanceof AnswerError)) throw error;
-      told = ["bad", error.message];
-    }
+    const outcome = await act<SendAnswer>("send", {
+      robot,
+      command,
+      message: JSON.stringify(message),
+      lease_ms,
+    }).then(
+      (answer) => outcomeOf(command, answer),
+      (error: unknown) => ["bad", words(error)] as const,
+    );
     // A later command's answer, and another car's, must not be replaced by this one.
-    if (sending === this.sending && robot === this.robot) this.say(...told);
+    if (sending === this.sending && robot === this.robot) this.say(outcome[0], outcome[1]);
   }
 
   private say(kind: string, text: string): void {
     this.said.dataset.kind = kind;
     this.said.textContent = text;
   }
+}
+
+/** Whether the car has taken a command, and the words for the viewer. */
+function outcomeOf(
+  command: string,
+  { accepted, reason, after_ms }: SendAnswer,
+): readonly ["good" | "bad", string] {
+  const after = age(after_ms / 1000);
+  if (accepted) return ["good", `${command} accepted after ${after}`];
+  if (accepted === false) return ["bad", `${command} rejected: ${reason.replaceAll("_", " ")}`];
+  const missing = `No answer within ${after}. Does its agent run, and has its car.yaml downlink.cmd.${command}?`;
+  return ["bad", reason || missing];
 }

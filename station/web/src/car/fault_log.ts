@@ -1,6 +1,6 @@
 // The faults since this page was opened, the newest first.
 
-import { el, setAttribute, Text } from "../base/dom";
+import { el, panel, setAttribute, Text, table } from "../base/dom";
 import { age, clockTime, zone } from "../base/format";
 import type { Fault, Robot } from "../live/robot";
 
@@ -22,19 +22,9 @@ export class FaultLog {
       const cells = ["fault-at", "fault-name", "fault-for"].map((name) => new Text(name, "td"));
       return { node: el("tr", {}, ...cells.map(({ node }) => node)), cells };
     });
-    const head = el(
-      "tr",
-      {},
-      ...[`Since, ${zone(Date.now() / 1000)}`, "Fault", "For"].map((name) =>
-        el("th", { scope: "col" }, name),
-      ),
-    );
-    this.node = el(
-      "section",
-      { class: "panel faults", "aria-label": "Fault log" },
-      el("header", {}, el("h3", {}, "Fault log"), this.note.node),
-      el("table", {}, el("thead", {}, head), el("tbody", {}, ...this.rows.map(({ node }) => node))),
-    );
+    const head = [`Since, ${zone(Date.now() / 1000)}`, "Fault", "For"];
+    const body = el("tbody", {}, ...this.rows.map(({ node }) => node));
+    this.node = panel("Fault log", "faults", [this.note.node], table(head, body));
   }
 
   refresh(robot: Robot): void {

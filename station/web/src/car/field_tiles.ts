@@ -2,7 +2,7 @@
 // of bytes has its newest thumbnail.
 
 import { type FieldTable, STALE_S } from "../base/contract";
-import { el, setAttribute, Text } from "../base/dom";
+import { button, el, setAttribute, Text } from "../base/dom";
 import { age, type Spec, spec, write } from "../base/format";
 import { Sparkline } from "../charts/sparkline";
 import { claimed, partsOf } from "../live/attachments";
@@ -30,14 +30,9 @@ class Tile {
       this.spark.node,
     ];
     const title = meaning ? `${field}: ${meaning}` : field;
-    this.node = choose
-      ? el(
-          "button",
-          { type: "button", class: "tile", title: `${title}. Press to chart it.`, "aria-pressed": "false" },
-          ...parts,
-        )
-      : el("div", { class: "tile", title }, ...parts);
-    if (choose) this.node.addEventListener("click", choose);
+    const pressed = { class: "tile", title: `${title}. Press to chart it.`, "aria-pressed": "false" };
+    this.node = choose ? button("", choose, pressed) : el("div", { class: "tile", title });
+    this.node.append(...parts);
   }
 
   /** Change the format. */
@@ -48,11 +43,8 @@ class Tile {
 
   set(value: Parameters<typeof write>[0]): void {
     this.value.set(write(value, this.spec));
-    setAttribute(
-      this.node,
-      "data-text",
-      String(typeof value === "string" || (this.spec.texts !== undefined && value !== 0)),
-    );
+    const text = typeof value === "string" || (this.spec.texts !== undefined && value !== 0);
+    setAttribute(this.node, "data-text", String(text));
   }
 
   mark(charted: boolean): void {
@@ -135,14 +127,8 @@ export class StreamSection {
     if (fresh.length === 0) return;
     for (const field of fresh) {
       const charts = !Number.isNaN(numeric(this.stream.sample.get(field)));
-      this.tiles.set(
-        field,
-        new Tile(
-          field,
-          spec(field, this.table, this.ros2, this.stream.name),
-          charts ? () => this.choose(fieldKey(this.stream.name, field)) : undefined,
-        ),
-      );
+      const choose = charts ? () => this.choose(fieldKey(this.stream.name, field)) : undefined;
+      this.tiles.set(field, new Tile(field, spec(field, this.table, this.ros2, this.stream.name), choose));
     }
     const known = Object.keys(this.table.fields);
     const place = (field: string): number => (known.includes(field) ? known.indexOf(field) : known.length);

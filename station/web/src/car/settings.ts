@@ -1,11 +1,17 @@
 // The settings of a car's agent, with what they may be. The page's server changes them as `iort config` does.
 
 import type { SettingEntry, SettingsAnswer } from "../base/contract";
-import { el } from "../base/dom";
+import { button, choices, el, form } from "../base/dom";
 import type { Robot } from "../live/robot";
-import { AnswerError, act } from "../server/answers";
+import { act, words } from "../server/answers";
 
 type Input = HTMLInputElement | HTMLSelectElement;
+
+/** A stream of which nothing was selected. */
+const ALL_FIELDS: Omit<SettingEntry, "name"> = {
+  ...{ kind: "fields", low: 0, high: 0, unit: "", names: [] },
+  ...{ value: "", desired: false, pending: null, reason: "" },
+};
 
 export class Settings {
   readonly node: HTMLDetailsElement;
@@ -15,13 +21,8 @@ export class Settings {
   private robot: Robot | undefined;
 
   constructor() {
-    this.node = el(
-      "details",
-      { class: "panel control-panel" },
-      el("summary", {}, el("h3", {}, "Settings")),
-      this.rows,
-      this.said,
-    );
+    const title = el("summary", {}, el("h3", {}, "Settings"));
+    this.node = el("details", { class: "panel control-panel" }, title, this.rows, this.said);
     this.node.addEventListener("toggle", () => void this.load());
   }
 
@@ -50,8 +51,7 @@ export class Settings {
       const answer = await act<SettingsAnswer>(action, { robot: name, ...parameters });
       if (name === this.name) this.draw(answer);
     } catch (error) {
-      if (!(error instanceof AnswerError)) throw error;
-      if (name === this.name) this.say("bad", error.message);
+      if (name === this.name) this.say("bad", words(error));
     }
   }
 
@@ -60,30 +60,13 @@ export class Settings {
     const free = [...(this.robot?.streams.keys() ?? [])]
       .map((stream) => `fields.${stream}`)
       .filter((name) => !known.has(name));
-    const fields = free.map(
-      (name): SettingEntry => ({
-        name,
-        kind: "fields",
-        low: 0,
-        high: 0,
-        unit: "",
-        names: [],
-        value: "",
-        desired: false,
-        pending: null,
-        reason: "",
-      }),
-    );
+    const fields = free.map((name): SettingEntry => ({ ...ALL_FIELDS, name }));
     this.rows.replaceChildren(...[...settings, ...fields].map((entry) => this.row(entry)));
     const waits = settings.some(({ pending }) => pending !== null);
-    this.say(
-      "",
-      waits
-        ? online
-          ? "The agent has not answered yet."
-          : "The car is offline. It applies what is pending when it is back."
-        : "",
-    );
+    const why = online
+      ? "The agent has not answered yet."
+      : "The car is offline. It applies what is pending when it is back.";
+    this.say("", waits ? why : "");
   }
 
   private row(entry: SettingEntry): HTMLElement {
@@ -96,41 +79,24 @@ export class Settings {
       { type: "submit", class: "tool", "aria-label": `Set ${name}`, hidden: "" },
       "Set",
     );
-    const undo = el(
-      "button",
-      {
-        type: "button",
-        class: "tool",
-        title: "Return to the value of car.yaml",
-        "aria-label": `Reset ${name}`,
-      },
-      "Reset",
-    );
+    const undo = button("Reset", () => void this.ask("set", { name }), {
+      title: "Return to the value of car.yaml",
+      "aria-label": `Reset ${name}`,
+    });
     undo.hidden = !desired;
+    const waiting = `${pending === "" ? "all fields are pending" : "pending"}; in force is ${value || "car.yaml's"}`;
     const note = reason
       ? el("p", { class: "said", "data-kind": "bad" }, `rejected: ${reason}`)
-      : pending === null
-        ? ""
-        : el(
-            "p",
-            { class: "said" },
-            `${pending === "" ? "all fields are pending" : "pending"}; in force is ${value || "car.yaml's"}`,
-          );
-    const row = el(
-      "form",
+      : el("p", { class: "said" }, pending === null ? "" : waiting);
+    input.addEventListener("input", () => (set.hidden = input.value === (pending ?? value)));
+    return form(
       { class: "setting" },
+      () => void this.ask("set", { name, value: input.value }),
       el("label", {}, name, input, ...(unit ? [el("span", { class: "unit" }, unit)] : [])),
       set,
       undo,
-      note,
+      ...(reason || pending !== null ? [note] : []),
     );
-    input.addEventListener("input", () => (set.hidden = input.value === (pending ?? value)));
-    row.addEventListener("submit", (event) => {
-      event.preventDefault();
-      void this.ask("set", { name, value: input.value });
-    });
-    undo.addEventListener("click", () => void this.ask("set", { name }));
-    return row;
   }
 
   private say(kind: string, text: string): void {
@@ -145,10 +111,6 @@ function inputOf({ kind, low, high, names, value }: SettingEntry): Input {
     return el("input", { type: "number", min: String(low), max: String(high), step: "any", required: "" });
   if (kind === "fields")
     return el("input", { type: "text", placeholder: "all fields", spellcheck: "false", autocomplete: "off" });
-  const choices = kind === "flag" ? ["true", "false"] : names;
-  return el(
-    "select",
-    {},
-    ...[...(value === "" ? [""] : []), ...choices].map((each) => el("option", { value: each }, each)),
-  );
+  const known = kind === "flag" ? ["true", "false"] : names;
+  return el("select", {}, ...choices(value === "" ? ["", ...known] : known));
 }

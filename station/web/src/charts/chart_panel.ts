@@ -1,6 +1,6 @@
 // A heading with readings above a live chart. While the pointer is on the chart, the readings are of its time.
 
-import { el, setAttribute, Text } from "../base/dom";
+import { el, panel, setAttribute, Text } from "../base/dom";
 import { AS_SENT, age, type Linear, linear, number } from "../base/format";
 import { LiveChart, type LiveChartOptions, type Shown } from "./live_chart";
 
@@ -23,6 +23,7 @@ export interface ChartPanelOptions {
 
 export class ChartPanel {
   readonly node: HTMLElement;
+  readonly title: string;
   private readonly texts: Text[];
   private readonly note = new Text("note");
   private readonly chart: LiveChart;
@@ -33,30 +34,25 @@ export class ChartPanel {
 
   constructor(private readonly options: ChartPanelOptions) {
     const { title, readings, chart } = options;
+    this.title = title;
     this.texts = readings.map(({ name }) => new Text("num", "span", { "data-reading": name }));
     this.units = readings.map(({ unit }) => {
       const text = new Text("unit");
       text.set(unit);
       return text;
     });
-    const heading = el(
-      "header",
-      {},
-      el("h3", {}, title),
-      this.note.node,
-      ...readings.map(({ label, line }, i) =>
-        el(
-          "p",
-          { class: "reading" },
-          ...(line === undefined ? [] : [el("span", { class: `key ${chart.lines[line]!.colour.slice(2)}` })]),
-          ...(label ? [el("span", { class: "label" }, label)] : []),
-          this.texts[i]!.node,
-          this.units[i]!.node,
-        ),
+    const values = readings.map(({ label, line }, i) =>
+      el(
+        "p",
+        { class: "reading" },
+        ...(line === undefined ? [] : [el("span", { class: `key ${chart.lines[line]!.colour.slice(2)}` })]),
+        ...(label ? [el("span", { class: "label" }, label)] : []),
+        this.texts[i]!.node,
+        this.units[i]!.node,
       ),
     );
     const plot = el("div", { class: "plot" });
-    this.node = el("section", { class: "panel", "aria-label": title }, heading, plot);
+    this.node = panel(title, "", [this.note.node, ...values], plot);
     this.chart = new LiveChart(plot, {
       ...chart,
       about: {

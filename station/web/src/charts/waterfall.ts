@@ -1,7 +1,7 @@
 // The delay by hop: a bar for each hop of a message, which begins at the end of the one before.
 
 import type { Config } from "../base/contract";
-import { el, setAttribute, Text } from "../base/dom";
+import { el, panel, setAttribute, Text } from "../base/dom";
 import { milliseconds, NOTHING } from "../base/format";
 import { MEDIAN_S } from "../live/bounds";
 import { type Delay, LEGS, type Leg, type Robot } from "../live/robot";
@@ -43,31 +43,15 @@ export class Waterfall {
         el("dd", { class: "fall-ms" }, text.node, el("span", { class: "unit" }, "ms")),
       );
     }
-    this.node = el(
-      "section",
-      { class: "panel waterfall", "aria-label": "Delay by hop" },
-      el(
-        "header",
-        {},
-        el("h3", {}, "Delay by hop"),
-        el(
-          "p",
-          { class: "reading" },
-          el(
-            "span",
-            {
-              class: "label",
-              title: "from leaving the car to arriving at the page, which then has to draw it",
-            },
-            "car to page",
-          ),
-          this.median.node,
-          el("span", { class: "unit" }, "ms"),
-        ),
-      ),
-      list,
-      this.warning.node,
+    const title = "from leaving the car to arriving at the page, which then has to draw it";
+    const whole = el(
+      "p",
+      { class: "reading" },
+      el("span", { class: "label", title }, "car to page"),
+      this.median.node,
+      el("span", { class: "unit" }, "ms"),
     );
+    this.node = panel("Delay by hop", "waterfall", [whole], list, this.warning.node);
   }
 
   /** `screen_ms`: the median of how long the page took from a message's arrival to drawing it. */

@@ -8,7 +8,7 @@ import {
   DRIVE_RATE_HZ,
   type DriveLimitsEntry,
 } from "../base/contract";
-import { el, onPress, setAttribute, Text } from "../base/dom";
+import { button, el, newName, onPress, panel, setAttribute, setText, Text } from "../base/dom";
 import { capital, NOTHING, number } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { may } from "../server/admission";
@@ -17,7 +17,7 @@ import { Driver } from "./driver";
 import { Inputs } from "./inputs";
 import { readLive } from "./live_message";
 import { DriveSocket } from "./socket";
-import { meant } from "./stick";
+import { CENTRE, meant } from "./stick";
 import type { Stops } from "./stops";
 
 const FIRST_TOP_MPS = 0.5;
@@ -29,6 +29,9 @@ const WORDS = {
   holding:
     "You hold the car: it stands until you drive on, or leave the wheel. Then others may drive it, also a planner on board.",
 } as const;
+const STICK = "Stick: up is ahead";
+const HELP =
+  "Keys: hold Space, steer with the arrows or WASD, Escape leaves. Gamepad: hold L1 or R1. Mouse: drag the stick. Touch: hold the button, and move the stick. Letting go stops the car, and it stands until you leave the wheel.";
 const UNHEARD = "The car does not hear you: others may drive it, also a planner on board.";
 
 /** What a viewer has while at the wheel. */
@@ -42,18 +45,14 @@ interface Wheel {
 
 export class DrivePanel {
   readonly node: HTMLElement;
-  private readonly take = el("button", { type: "button", class: "tool primary" }, "Take the wheel");
-  private readonly leave = el("button", { type: "button", class: "tool" }, "Leave the wheel");
-  private readonly over = el("button", { type: "button", class: "tool", hidden: "" });
+  private readonly take = button("Take the wheel", () => this.enter(), { class: "tool primary" });
+  private readonly leave = button("Leave the wheel", () => this.exit());
+  private readonly over = button("", undefined, { hidden: "" });
   private readonly who = new Text("note");
   private readonly said = el("p", { class: "drive-said", role: "status" });
   private readonly knob = el("span", { class: "knob" });
-  private readonly pad = el(
-    "div",
-    { class: "stick", role: "img", "aria-label": "Stick: up is ahead" },
-    this.knob,
-  );
-  private readonly hold = el("button", { type: "button", class: "deadman" }, "Hold to drive");
+  private readonly pad = el("div", { class: "stick", role: "img", "aria-label": STICK }, this.knob);
+  private readonly hold = button("Hold to drive", undefined, { class: "deadman" });
   private readonly top = el("input", { type: "range", name: "top", min: "0.1", step: "0.1" });
   private readonly topWords = new Text("num");
   private readonly name = el("input", {
@@ -79,8 +78,6 @@ export class DrivePanel {
   ) {
     this.name.value = kept("name") ?? "";
     this.name.addEventListener("change", () => keep("name", this.name.value));
-    this.take.addEventListener("click", () => this.enter());
-    this.leave.addEventListener("click", () => this.exit());
     onPress(this.over, () => this.takeOver());
     this.over.addEventListener("blur", () => (this.sure = false));
     this.top.addEventListener("input", () => this.topped());
@@ -90,28 +87,12 @@ export class DrivePanel {
       el("label", {}, el("span", {}, "Top speed ", this.topWords.node), this.top),
       ...Object.values(this.figures).map(({ node }) => node),
     );
-    const help = el(
-      "p",
-      { class: "note drive-help" },
-      "Keys: hold Space, steer with the arrows or WASD, Escape leaves. Gamepad: hold L1 or R1. Mouse: drag the stick. Touch: hold the button, and move the stick. Letting go stops the car, and it stands until you leave the wheel.",
-    );
+    const help = el("p", { class: "note drive-help" }, HELP);
     this.body = el("div", { class: "drive-body", hidden: "" }, this.pad, this.hold, limits, help);
-    this.node = el(
-      "section",
-      { class: "panel drive", "aria-label": "Drive", hidden: "" },
-      el(
-        "header",
-        {},
-        el("h3", {}, "Drive"),
-        this.who.node,
-        el("label", { class: "drive-name" }, "as ", this.name),
-        this.take,
-        this.leave,
-      ),
-      this.said,
-      this.over,
-      this.body,
-    );
+    const named = el("label", { class: "drive-name" }, "as ", this.name);
+    const beside = [this.who.node, named, this.take, this.leave];
+    this.node = panel("Drive", "drive", beside, this.said, this.over, this.body);
+    this.node.hidden = true;
     this.leave.hidden = true;
   }
 
@@ -159,13 +140,8 @@ export class DrivePanel {
       state: (reason) => driver.block(reason),
     });
     driver.block("Connecting …");
-    this.wheel = {
-      driver,
-      inputs,
-      socket,
-      limits,
-      timer: window.setInterval(() => this.tick(), TICK_S * 1000),
-    };
+    const timer = window.setInterval(() => this.tick(), TICK_S * 1000);
+    this.wheel = { driver, inputs, socket, limits, timer };
     this.topped();
     this.arranged();
     this.hold.focus({ preventScroll: true });
@@ -231,10 +207,7 @@ export class DrivePanel {
     const age = driver.age_ms(at_ms);
     this.figures.rtt.set(driver.rtt_ms, DRIVE_MAX_RTT_MS, "ms");
     this.figures.age.set(age, DRIVE_MAX_AGE_MS, "ms");
-    const motion = meant(phase === "driving" ? stick : { x: 0, y: 0 }, {
-      top_mps: driver.top_mps,
-      ...limits,
-    });
+    const motion = meant(phase === "driving" ? stick : CENTRE, { top_mps: driver.top_mps, ...limits });
     this.figures.asked.text(`${number(motion.speed_mps, 1)} m/s, ${number(motion.steering_rad, 2)} rad`);
     const who = driver.driving(at_ms);
     this.who.set(who ? (who.mine ? "you drive" : `${who.by} drives`) : "nobody drives");
@@ -267,8 +240,7 @@ export class DrivePanel {
   }
 
   private say(text: string): void {
-    const words = capital(text);
-    if (this.said.textContent !== words) this.said.textContent = words;
+    setText(this.said, capital(text));
   }
 }
 
@@ -280,13 +252,8 @@ function figure(label: string): {
 } {
   const value = new Text("num");
   const limit = new Text("note");
-  const node = el(
-    "p",
-    { class: "drive-figure" },
-    el("span", { class: "label" }, label),
-    value.node,
-    limit.node,
-  );
+  const name = el("span", { class: "label" }, label);
+  const node = el("p", { class: "drive-figure" }, name, value.node, limit.node);
   return {
     node,
     text: (text) => value.set(text),
@@ -297,6 +264,3 @@ function figure(label: string): {
     },
   };
 }
-
-const newName = (): string =>
-  Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");

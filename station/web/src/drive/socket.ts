@@ -13,7 +13,8 @@ import {
   VIEW_LEASE_MS,
   VIEW_RENEW_S,
 } from "../base/contract";
-import { AnswerError, act } from "../server/answers";
+import { newName } from "../base/dom";
+import { AnswerError, act, words } from "../server/answers";
 import type { Command } from "./command";
 
 declare const mqtt: { connect(url: string, options: IClientOptions): MqttClient };
@@ -32,9 +33,7 @@ export class DriveSocket {
   private timer: number | undefined;
   private renewing: number | undefined;
   private closed = false;
-  private readonly viewer = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) =>
-    b.toString(16).padStart(2, "0"),
-  ).join("");
+  private readonly viewer = newName();
 
   constructor(
     private readonly namespace: string,
@@ -70,7 +69,7 @@ export class DriveSocket {
       const { url, client_id } = await act<SocketAnswer>("drive", {});
       if (!this.closed) this.connect(url, client_id);
     } catch (error) {
-      this.lose(error instanceof AnswerError ? error.message : String(error));
+      this.lose(words(error));
     }
   }
 

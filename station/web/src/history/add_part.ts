@@ -1,17 +1,17 @@
 // Adds a run of any robot to a comparison, or one of its laps.
 
-import type { LapsAnswer, RunsAnswer } from "../base/contract";
-import { NAME } from "../base/contract";
-import { byName, el, Text } from "../base/dom";
+import { type LapsAnswer, NAME, type RunsAnswer } from "../base/contract";
+import { byName, choices, el, form, Text } from "../base/dom";
 import { age, number, when } from "../base/format";
+import { inUs, rangeOf } from "../base/range";
 import type { Part } from "../base/route";
 import type { Fleet } from "../live/fleet";
-import { AnswerError, ask } from "../server/answers";
+import { ask, Latest, words } from "../server/answers";
 
 const RUNS = 20;
 
 export class AddPart {
-  readonly node = el("form", { class: "range" });
+  readonly node: HTMLElement;
   private readonly robot = el("input", {
     id: "part-robot",
     list: "part-robots",
@@ -24,34 +24,33 @@ export class AddPart {
   private readonly note = new Text("note", "span", { role: "status" });
   private runs: Part[] = [];
   private laps: Part[] = [];
-  private looking: AbortController | undefined;
+  private readonly looking = new Latest();
   private stream = "";
 
   constructor(
     private readonly fleet: Fleet,
     add: (part: Part) => void,
   ) {
-    const button = el("button", { type: "submit", class: "tool" }, "Add");
-    this.node.append(
+    this.node = form(
+      { class: "range" },
+      () => {
+        const part = this.laps[this.lap.selectedIndex - 1] ?? this.runs[this.run.selectedIndex];
+        if (part) add(part);
+      },
       el("label", {}, "robot ", this.robot, this.known),
       el("label", {}, "run ", this.run),
       el("label", {}, "lap ", this.lap),
-      button,
+      el("button", { type: "submit", class: "tool" }, "Add"),
       this.note.node,
     );
     this.robot.addEventListener("change", () => void this.find());
     this.run.addEventListener("change", () => void this.findLaps());
-    this.node.addEventListener("submit", (event) => {
-      event.preventDefault();
-      const part = this.laps[this.lap.selectedIndex - 1] ?? this.runs[this.run.selectedIndex];
-      if (part) add(part);
-    });
   }
 
   /** Offer the runs of a stream. */
   show(stream: string, robots: readonly string[]): void {
     const names = [...new Set([...robots, ...this.fleet.robots.keys()])].sort(byName);
-    this.known.replaceChildren(...names.map((name) => el("option", { value: name })));
+    this.known.replaceChildren(...choices(names));
     if (stream === this.stream && this.runs.length > 0) return;
     this.stream = stream;
     this.robot.value ||= robots[0] ?? "";
@@ -70,48 +69,41 @@ export class AddPart {
     try {
       const { runs } = await ask<RunsAnswer>("runs", { robot, count: String(RUNS) });
       if (robot !== this.robot.value.trim() || stream !== this.stream) return;
-      const parts = runs
-        .filter((run) => Object.hasOwn(run.streams, stream))
-        .map((run) => run.streams[stream]!);
-      this.runs = parts.map(({ from_us, to_us }) => ({
-        robot,
-        range: [Math.floor(from_us / 1000) / 1000, Math.ceil(to_us / 1000) / 1000],
-      }));
+      const of = runs.filter((run) => Object.hasOwn(run.streams, stream));
+      this.runs = of.map(({ streams }) => ({ robot, range: rangeOf(streams[stream]!) }));
       this.run.replaceChildren(
         ...this.runs.map(({ range: [from, to] }) => el("option", {}, `${when(from)}, ${age(to - from)}`)),
       );
-      if (parts.length === 0) this.note.set(`${robot} has no runs of ${stream}.`);
+      if (of.length === 0) this.note.set(`${robot} has no runs of ${stream}.`);
       await this.findLaps();
     } catch (error) {
       if (robot !== this.robot.value.trim()) return;
       this.run.replaceChildren();
-      this.note.set(error instanceof AnswerError ? error.message : String(error));
+      this.note.set(words(error));
     }
   }
 
   /** Offer the laps of the chosen run, if it has any. */
   private async findLaps(): Promise<void> {
-    this.looking?.abort();
-    const looking = (this.looking = new AbortController());
+    this.looking.stop();
     const run = this.runs[this.run.selectedIndex];
     this.offer([]);
     if (!run) return;
-    const [from_us, to_us] = run.range.map((at) => String(Math.round(at * 1e6))) as [string, string];
-    try {
-      this.offer(
-        (await ask<LapsAnswer>("laps", { robot: run.robot, from_us, to_us }, looking.signal)).laps,
-        run.robot,
-      );
-    } catch {
+    await this.looking.run(
+      async (signal) => {
+        const asked = { robot: run.robot, ...inUs(run.range) };
+        this.offer((await ask<LapsAnswer>("laps", asked, signal)).laps, run.robot);
+      },
       // The whole run can be added anyway.
-    }
+      () => undefined,
+    );
   }
 
   private offer(laps: LapsAnswer["laps"], robot = ""): void {
     this.laps = laps.map(({ from_us, to_us }) => ({ robot, range: [from_us / 1e6, to_us / 1e6] }));
-    const told = laps.map(
+    const texts = laps.map(
       ({ lap, time_s, best }) => `${lap}: ${number(time_s, 2)} s${best ? ", the best" : ""}`,
     );
-    this.lap.replaceChildren(...["the whole run", ...told].map((text) => el("option", {}, text)));
+    this.lap.replaceChildren(...choices(["the whole run", ...texts]));
   }
 }

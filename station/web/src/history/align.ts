@@ -1,7 +1,7 @@
 // Puts several ranges on one axis: the time since each began, or the distance since then.
 
 import { type HistoryAnswer, TACHOMETER_COUNTS, type Value } from "../base/contract";
-import { type Linear, linear } from "../base/format";
+import { type Linear, linear, POSITIONS } from "../base/format";
 
 export type Axis = "time" | "distance";
 
@@ -19,24 +19,11 @@ const MOST_MPS = 100;
 const LEAST_STEP_S = 0.1;
 // Shorter steps between positions count once they add up: they may be the noise of a car that stands.
 const LEAST_STEP_M = 0.1;
-const POSITIONS = [
-  "pose.pose.position.",
-  "pose.position.",
-  "position.",
-  "transform.translation.",
-  "translation.",
-  "pose.",
-  "",
-];
-
 /**
  * The metres driven since the first row: from the tachometer, the position, or the speed; undefined without any of
  * them. `speed` is the car's, of its motor's speed: the tachometer needs it too.
  */
-export function distance(
-  { times_s, fields }: HistoryAnswer,
-  speed: Linear | undefined,
-): number[] | undefined {
+export function distance({ times_s, fields }: HistoryAnswer, speed?: Linear): number[] | undefined {
   const column = (name: string): readonly Value[] | undefined =>
     Object.hasOwn(fields, name) ? fields[name]!.mean : undefined;
   const rows = times_s.length;
@@ -92,12 +79,8 @@ export function onGrid({ x, y }: Line, grid: readonly number[], hole: number): (
   return grid.map((at) => {
     if (x.length === 0 || at < x[0]! || at > x.at(-1)!) return null;
     while (i < x.length - 2 && x[i + 1]! < at) i += 1;
-    const [x0, x1, y0, y1] = [
-      x[i]!,
-      x[Math.min(i + 1, x.length - 1)]!,
-      y[i] ?? null,
-      y[Math.min(i + 1, x.length - 1)] ?? null,
-    ];
+    const next = Math.min(i + 1, x.length - 1);
+    const [x0, x1, y0, y1] = [x[i]!, x[next]!, y[i] ?? null, y[next] ?? null];
     if (at === x0 || x1 === x0) return y0;
     if (at === x1) return y1;
     if (y0 === null || y1 === null || x1 - x0 > hole) return null;

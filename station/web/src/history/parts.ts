@@ -1,13 +1,13 @@
 // Loads the parts of a comparison, and puts them on one grid.
 
 import type { FieldTable, HistoryAnswer } from "../base/contract";
-import { asSpeed, linear, type Spec, spec } from "../base/format";
-import type { Range } from "../base/range";
+import { asSpeed, numbers, type Spec, spec } from "../base/format";
+import { inUs, type Range } from "../base/range";
 import type { Part } from "../base/route";
 import type { Fleet } from "../live/fleet";
 import { ask } from "../server/answers";
 import { type Axis, distance, onGrid } from "./align";
-import type { Compared } from "./compare_charts";
+import type { Charted } from "./field_charts";
 
 // The rows of a request, and the steps of the grid: about the width of a chart in points.
 const ROWS = 1500;
@@ -24,6 +24,13 @@ interface Loaded {
   readonly x: readonly number[];
 }
 
+/** The parts' values on a common grid, in the range that is zoomed to; the whole range; and how many samples there are. */
+interface Compared extends Omit<Charted, "names"> {
+  readonly extent: Range;
+  readonly samples: number;
+  readonly archived: boolean;
+}
+
 /** Raised for parts that have no distance. */
 export class NoDistance extends Error {}
 
@@ -36,19 +43,14 @@ export class Parts {
     private readonly fleet: Fleet,
   ) {}
 
-  /** The number of samples, whether some come from the archive, the whole range of x, and the values in the range `zoom` of it. Throws `NoDistance`. */
+  /** Throws `NoDistance`. */
   async load(
     parts: readonly Part[],
     stream: string,
     axis: Axis,
     zoom: Range | undefined,
     signal: AbortSignal,
-  ): Promise<{
-    readonly samples: number;
-    readonly archived: boolean;
-    readonly extent: Range;
-    readonly compared: Compared;
-  }> {
+  ): Promise<Compared> {
     const wholes = await Promise.all(
       parts.map(async (part) => this.placed(part, await this.read(part, stream), axis)),
     );
@@ -61,12 +63,8 @@ export class Parts {
     const grid = Array.from({ length: ROWS + 1 }, (_, i) => range[0] + i * step);
     const samples = wholes.reduce((sum, { drive }) => sum + drive.samples, 0);
     const archived = wholes.some(({ drive }) => drive.archive !== null);
-    return {
-      samples,
-      archived,
-      extent,
-      compared: { grid, unit: UNITS[axis], fields: this.fields(shown, stream, grid, axis) },
-    };
+    const fields = this.fields(shown, stream, grid, axis);
+    return { samples, archived, extent, x: grid, unit: UNITS[axis], hole: Infinity, fields };
   }
 
   /** The format of a field: the speed of the cars, if it is known of all of them. */
@@ -110,12 +108,8 @@ export class Parts {
     const [from, to] = [t[Math.max(0, first - 1)], t[Math.min(t.length - 1, last + 1)]];
     if (first < 0 || last < 0 || from === undefined || to === undefined || drive.row_s === 0)
       return { part, drive, t, x };
-    const finer = await asked(
-      part.robot,
-      stream,
-      [part.range[0] + from, part.range[0] + to + drive.row_s],
-      signal,
-    );
+    const range: Range = [part.range[0] + from, part.range[0] + to + drive.row_s];
+    const finer = await asked(part.robot, stream, range, signal);
     const there = this.placed(part, finer, axis);
     if (axis === "time") return there;
     const offset = onGrid({ x: t, y: x }, [there.t[0] ?? 0], Infinity)[0] ?? 0;
@@ -127,7 +121,7 @@ export class Parts {
     stream: string,
     grid: readonly number[],
     axis: Axis,
-  ): Compared["fields"] {
+  ): Charted["fields"] {
     const parts = shown.map(({ part }) => part);
     const numeric = ({ drive }: Loaded): string[] =>
       Object.keys(drive.fields).filter((field) =>
@@ -138,28 +132,16 @@ export class Parts {
     const all = this.spec("speed", stream, parts).unit === "m/s";
     if (names.has("speed") && all) names.delete("speed_mps");
     const column = (field: string, { part, drive, x }: Loaded): (number | null)[] => {
-      const as = asSpeed(
-        field,
-        spec(field, this.table, drive.ros2, stream),
-        all ? this.fleet.speed(part.robot) : undefined,
-      );
-      const y =
-        drive.fields[field]?.mean.map((value) => (typeof value === "number" ? linear(value, as) : null)) ??
-        [];
-      return y.length === 0
-        ? grid.map(() => null)
-        : onGrid({ x, y }, grid, axis === "time" ? Math.max(LEAST_HOLE_S, drive.row_s * HOLES) : Infinity);
+      const speed = all ? this.fleet.speed(part.robot) : undefined;
+      const as = asSpeed(field, spec(field, this.table, drive.ros2, stream), speed);
+      const y = numbers(drive.fields[field]?.mean ?? [], as);
+      if (y.length === 0) return grid.map(() => null);
+      const hole = axis === "time" ? Math.max(LEAST_HOLE_S, drive.row_s * HOLES) : Infinity;
+      return onGrid({ x, y }, grid, hole);
     };
     return new Map([...names].map((field) => [field, shown.map((each) => column(field, each))]));
   }
 }
 
-function asked(
-  robot: string,
-  stream: string,
-  [from, to]: Range,
-  signal?: AbortSignal,
-): Promise<HistoryAnswer> {
-  const [from_us, to_us] = [from, to].map((at) => String(Math.round(at * 1e6))) as [string, string];
-  return ask<HistoryAnswer>("history", { robot, stream, from_us, to_us, rows: String(ROWS) }, signal);
-}
+const asked = (robot: string, stream: string, range: Range, signal?: AbortSignal): Promise<HistoryAnswer> =>
+  ask<HistoryAnswer>("history", { robot, stream, ...inUs(range), rows: String(ROWS) }, signal);

@@ -2,15 +2,18 @@
 
 import type { FieldTable, HistoryAnswer } from "../base/contract";
 import { el } from "../base/dom";
-import { asSpeed, type Spec, spec } from "../base/format";
+import { asSpeed, numbers, type Spec, spec } from "../base/format";
 import type { Range } from "../base/range";
 import type { Hands, Mark } from "../charts/range_chart";
 import type { Fleet } from "../live/fleet";
 import { Comparison } from "../widgets/comparison";
 import { Download } from "./download";
-import { FieldCharts } from "./field_charts";
+import { type Charted, FieldCharts } from "./field_charts";
 import { Pictures } from "./pictures";
 import { Playback } from "./playback";
+
+const USUAL = ["speed", "voltage_input", "current_motor", "current_input", "duty_cycle", "temperature_pcb"];
+const MOST_CHARTS = 12;
 
 export interface ResultOptions {
   readonly hands: Omit<Hands, "pick">;
@@ -53,7 +56,11 @@ export class Result {
         this.wanted = this.charts.fields;
         changed();
       },
+      sync: "history",
+      usual: USUAL,
+      most: MOST_CHARTS,
     });
+    this.charts.node.classList.add("three");
     this.pictures = new Pictures(table);
     this.node.append(
       this.playback.node,
@@ -72,7 +79,7 @@ export class Result {
     // The speed of the car is shown as the field speed, where its parameters are known.
     if (this.spec("speed").unit === "m/s" && Object.hasOwn(drive.fields, "speed")) claims.add("speed_mps");
     const fields = Object.keys(drive.fields).filter((field) => !claims.has(field));
-    this.charts.set(drive, fields, range, this.wanted);
+    this.charts.set(this.charted(drive, fields), range, this.wanted);
     this.comparison.of(fields.map((field) => [field, this.spec(field)]));
     this.playback.set(drive.times_s);
     this.return();
@@ -102,6 +109,17 @@ export class Result {
   /** Show the newest live values. */
   clock(): void {
     if (this.drive) this.comparison.now(this.fleet.robots.get(this.robot)?.streams.get(this.stream));
+  }
+
+  /** The fields with numbers, as they are shown. */
+  private charted({ times_s, fields, row_s }: HistoryAnswer, names: readonly string[]): Charted {
+    const columns = names.flatMap((name) => {
+      const { mean, least, most } = fields[name]!;
+      if (!mean.some((value) => typeof value === "number")) return [];
+      const each = least !== undefined && most !== undefined ? [mean, least, most] : [mean];
+      return [[name, each.map((values) => numbers(values, this.spec(name)))] as const];
+    });
+    return { x: times_s, hole: Math.max(1, row_s * 2.5), fields: new Map(columns), names: [""] };
   }
 
   private spec(field: string): Spec {

@@ -1,16 +1,16 @@
 // A robot's runs: each opens its range, and several open side by side.
 
 import type { Extent, Run, RunsAnswer } from "../base/contract";
-import { el } from "../base/dom";
+import { button, el, table } from "../base/dom";
 import { age, number, when } from "../base/format";
-import { type Range, writeTime } from "../base/range";
-import { MOST_PARTS, route, writeParts } from "../base/route";
+import { type Range, rangeOf, writeTime } from "../base/range";
+import { offerComparison, route } from "../base/route";
 
 export class RunsList {
   readonly node = el("details", { class: "panel runs" });
   private readonly about = el("summary", {}, "Runs");
   private readonly body = el("tbody");
-  private readonly more = el("button", { type: "button", class: "tool" }, "Older runs");
+  private readonly more = button("Older runs", () => this.older(this.runs.at(-1)!.from_us));
   private readonly compare = el("a", { class: "tool" }, "Compare");
   private readonly chosen = new Map<string, Range>();
   private robot = "";
@@ -19,16 +19,10 @@ export class RunsList {
   private extents: Readonly<Record<string, Extent>> = {};
 
   /** `older` is called for the runs before a time in microseconds. */
-  constructor(older: (before_us: number) => void) {
-    const head = el(
-      "tr",
-      {},
-      ...["Compare", "Start", "Length", "Samples", "State"].map((name) => el("th", { scope: "col" }, name)),
-    );
-    this.more.addEventListener("click", () => older(this.runs.at(-1)!.from_us));
+  constructor(private readonly older: (before_us: number) => void) {
     this.node.append(
       this.about,
-      el("table", {}, el("thead", {}, head), this.body),
+      table(["Compare", "Start", "Length", "Samples", "State"], this.body),
       el("p", { class: "tools" }, this.more, this.compare),
     );
   }
@@ -37,12 +31,12 @@ export class RunsList {
   newest(stream: string): Range | undefined {
     const run = this.runs.find(({ streams }) => Object.hasOwn(streams, stream));
     const part = run ? run.streams[stream] : this.runs[0];
-    return part && range(part);
+    return part && rangeOf(part);
   }
 
   /** All that is stored of a stream, where known. */
   extent(stream: string): Range | undefined {
-    return Object.hasOwn(this.extents, stream) ? range(this.extents[stream]!) : undefined;
+    return Object.hasOwn(this.extents, stream) ? rangeOf(this.extents[stream]!) : undefined;
   }
 
   set(robot: string, answer: RunsAnswer | undefined): void {
@@ -80,7 +74,7 @@ export class RunsList {
 
   private row(run: Run): HTMLElement {
     const part = run.streams[this.stream]!;
-    const [from, to] = range(part);
+    const [from, to] = rangeOf(part);
     const { robot, stream } = this;
     const check = el("input", { type: "checkbox", "aria-label": `Compare the run of ${when(from)}` });
     check.checked = this.chosen.has(run.run);
@@ -89,13 +83,8 @@ export class RunsList {
       else this.chosen.delete(run.run);
       this.choose();
     });
-    const link = el(
-      "a",
-      {
-        href: route({ view: "history", robot, query: { stream, from: writeTime(from), to: writeTime(to) } }),
-      },
-      when(from),
-    );
+    const query = { stream, from: writeTime(from), to: writeTime(to) };
+    const link = el("a", { href: route({ view: "history", robot, query }) }, when(from));
     const samples = part.samples === null ? "" : number(part.samples);
     const state = run.lost > 0 ? `${run.state}, ${number(run.lost)} lost` : run.state;
     return el(
@@ -109,20 +98,6 @@ export class RunsList {
 
   private choose(): void {
     const parts = [...this.chosen.values()].map((range) => ({ robot: this.robot, range }));
-    const few =
-      parts.length < 2
-        ? "Check two runs to compare them"
-        : parts.length > MOST_PARTS
-          ? `At most ${MOST_PARTS} runs can be compared`
-          : "";
-    this.compare.textContent = few || `Compare ${parts.length} runs`;
-    if (few) this.compare.removeAttribute("href");
-    else
-      this.compare.href = route({ view: "compare", query: { runs: writeParts(parts), stream: this.stream } });
+    offerComparison(this.compare, parts, "runs", `Compare ${parts.length} runs`, { stream: this.stream });
   }
 }
-
-const range = ({ from_us, to_us }: Extent): Range => [
-  Math.floor(from_us / 1000) / 1000,
-  Math.ceil(to_us / 1000) / 1000,
-];

@@ -1,21 +1,20 @@
 // Starts an analysis in the cloud, and tells how far it is.
 
 import type { AnalysisAnswer, AnalysisStarted } from "../base/contract";
-import { el } from "../base/dom";
-import { AnswerError, act, ask } from "../server/answers";
+import { choices, el, form } from "../base/dom";
+import { act, ask, words } from "../server/answers";
 
-const RANGES = { "1 day": 86_400, "7 days": 7 * 86_400, "30 days": 30 * 86_400 } as const;
+const DAY_S = 86_400;
+const RANGES = [
+  [String(DAY_S), "last 1 day"],
+  [String(7 * DAY_S), "last 7 days"],
+  [String(30 * DAY_S), "last 30 days"],
+] as const;
 const POLL_MS = 1500;
 
 export class Analyse {
   readonly node: HTMLElement;
-  private readonly last = el(
-    "select",
-    { "aria-label": "Drives of the last" },
-    ...Object.entries(RANGES).map(([label, seconds]) =>
-      el("option", { value: String(seconds) }, `last ${label}`),
-    ),
-  );
+  private readonly last = el("select", { "aria-label": "Drives of the last" }, ...choices(RANGES));
   private readonly button = el("button", { type: "submit", class: "tool" }, "Analyse");
   private robot: string | undefined;
   private run = "";
@@ -26,11 +25,7 @@ export class Analyse {
     private readonly say: (text: string) => void,
     private readonly done: (drives: number) => void,
   ) {
-    this.node = el("form", { class: "range analyse" }, this.last, this.button);
-    this.node.addEventListener("submit", (event) => {
-      event.preventDefault();
-      void this.start();
-    });
+    this.node = form({ class: "range analyse" }, () => void this.start(), this.last, this.button);
   }
 
   /** Analyse the drives of this robot from now on; of all robots if undefined. */
@@ -81,6 +76,6 @@ export class Analyse {
 
   private fail(error: unknown): void {
     this.stop();
-    this.say(error instanceof AnswerError ? error.message : String(error));
+    this.say(words(error));
   }
 }

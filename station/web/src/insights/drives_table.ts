@@ -1,7 +1,7 @@
 // The analysed drives, and those that could not be analysed, with the reason.
 
 import type { DriveEntry } from "../base/contract";
-import { el } from "../base/dom";
+import { el, table } from "../base/dom";
 import { age, number, when } from "../base/format";
 import { writeTime } from "../base/range";
 import { route } from "../base/route";
@@ -27,28 +27,19 @@ export function drivesTable(
     .map((drive) => row(drive, robot === undefined, drive.from_us === chosen));
   const failed = drives.filter((drive) => drive.failed !== "").length;
   const title = `Drives: ${drives.length}${failed > 0 ? `, ${failed} could not be analysed` : ""}`;
-  const table = el(
-    "table",
-    {},
-    el("thead", {}, el("tr", {}, ...head.map((text) => el("th", { scope: "col" }, text)))),
-    el("tbody", {}, ...rows),
-  );
   return el(
     "section",
     { class: "panel drives", "aria-label": "Drives" },
     el("h3", {}, title),
-    el("div", { class: "log" }, table),
+    el("div", { class: "log" }, table(head, el("tbody", {}, ...rows))),
   );
 }
 
 function row(drive: DriveEntry, named: boolean, chosen: boolean): HTMLElement {
   const { robot, from_us, to_us, samples, failed, repairs, estimates } = drive;
   const [from, to] = [from_us / 1e6, to_us / 1e6];
-  const at = el(
-    "a",
-    { href: route({ view: "history", robot, query: { from: writeTime(from), to: writeTime(to) } }) },
-    when(from),
-  );
+  const query = { from: writeTime(from), to: writeTime(to) };
+  const at = el("a", { href: route({ view: "history", robot, query }) }, when(from));
   const repaired = Object.entries(repairs).map(
     ([kind, count]) => `${kind.replaceAll("_", " ")} ${number(count)}`,
   );

@@ -27,19 +27,10 @@ function item(finding: FindingEntry, named: boolean): HTMLElement {
     to: writeTime(Math.max(to, from + 1)),
     ...(fields.length > 0 ? { fields: fields.join(",") } : {}),
   };
-  const chance =
-    q === null
-      ? []
-      : [
-          el(
-            "span",
-            {
-              class: "note",
-              title: "The share of false findings among those that count as sure as this one",
-            },
-            `false alarms: ${q < 1e-5 ? "less than 0.001" : `${number(q * 100, q < 0.001 ? 3 : 1)}`} % of such findings`,
-          ),
-        ];
+  const share = (q: number): string => (q < 1e-5 ? "less than 0.001" : number(q * 100, q < 0.001 ? 3 : 1));
+  const title = "The share of false findings among those that count as sure as this one";
+  const chance = (q: number): HTMLElement =>
+    el("span", { class: "note", title }, `false alarms: ${share(q)} % of such findings`);
   return el(
     "li",
     { class: "panel finding", "data-severity": severity, "data-kind": kind },
@@ -58,7 +49,7 @@ function item(finding: FindingEntry, named: boolean): HTMLElement {
       "p",
       { class: "seen" },
       el("a", { class: "tool", href: route({ view: "history", robot, query }) }, "Show the evidence"),
-      ...chance,
+      ...(q === null ? [] : [chance(q)]),
     ),
   );
 }

@@ -1,19 +1,19 @@
 // The laps of a drive: a table with the best one, and two of them against distance.
 
 import type { DeltaAnswer, Lap, LapsAnswer } from "../base/contract";
-import { el, Text } from "../base/dom";
-import { number, when } from "../base/format";
-import type { Range } from "../base/range";
-import { MOST_PARTS, route, writeParts } from "../base/route";
-import { type Curve, RangeChart } from "../charts/range_chart";
-import { dash, hue } from "../history/compare_charts";
-import { AnswerError, ask } from "../server/answers";
+import { el, panel, Text, table } from "../base/dom";
+import { capital, number, when } from "../base/format";
+import { inUs, type Range, same } from "../base/range";
+import { MOST_PARTS, offerComparison } from "../base/route";
+import { type Columns, dash, hue, LinesPanel } from "../charts/lines_panel";
+import { ask, Latest } from "../server/answers";
 import { words } from "./figures";
 
 const METHODS: Readonly<Record<string, string>> = {
   gate: "Laps by crossing a gate of the position",
   pattern: "Laps by the pattern of the drive, because no stream has a position",
 };
+const FIGURES = { lap_best_s: "best", lap_mean_s: "mean", lap_energy_wh_per_km: "energy" };
 const HEAD = ["Compare", "Lap", "Start", "Time", "Behind", "Distance", "Energy", "per km", "Mean"];
 const SYNC = "laps";
 
@@ -24,8 +24,8 @@ export class LapsPanel {
   private readonly table = el("div", { class: "laps-table", hidden: "" });
   private readonly compare = el("a", { class: "tool" });
   private readonly charts = el("div", { class: "charts" });
-  private drawn: RangeChart[] = [];
-  private loading: AbortController | undefined;
+  private drawn: LinesPanel[] = [];
+  private readonly loading = new Latest();
   private chosen: number[] = [];
   private laps: readonly Lap[] = [];
   private robot = "";
@@ -33,57 +33,24 @@ export class LapsPanel {
 
   /** `changed` is called with the chosen laps. */
   constructor(private readonly changed: (laps: readonly number[]) => void) {
-    this.table.append(
-      el(
-        "table",
-        {},
-        el("thead", {}, el("tr", {}, ...HEAD.map((text) => el("th", { scope: "col" }, text)))),
-        this.body,
-      ),
-    );
-    this.node = el(
-      "section",
-      { class: "panel laps", "aria-label": "Laps" },
-      el("header", {}, el("h3", {}, "Laps"), this.compare),
-      this.note.node,
-      this.table,
-      this.charts,
-    );
+    this.table.append(table(HEAD, this.body));
+    this.node = panel("Laps", "laps", [this.compare], this.note.node, this.table, this.charts);
   }
 
   /** Show the laps of a robot in a range; `wanted` are those to compare, or else the best two. */
   async show(robot: string, range: Range, wanted: readonly number[]): Promise<void> {
-    if (
-      robot === this.robot &&
-      range[0] === this.range[0] &&
-      range[1] === this.range[1] &&
-      this.laps.length > 0
-    )
-      return;
+    if (robot === this.robot && same(range, this.range) && this.laps.length > 0) return;
     this.clear();
     [this.robot, this.range] = [robot, range];
-    const loading = (this.loading = new AbortController());
     this.note.set("Looking for laps …");
-    try {
-      const answer = await ask<LapsAnswer>("laps", this.asked(), loading.signal);
-      if (loading.signal.aborted) return;
-      this.laps = answer.laps;
-      this.note.set(about(answer));
-      this.table.hidden = answer.laps.length === 0;
-      const known = wanted.filter((lap) => lap <= answer.laps.length).slice(0, MOST_PARTS);
-      const fastest = answer.laps.filter(({ complete }) => complete).sort((a, b) => a.time_s - b.time_s);
-      this.chosen = known.length > 0 ? known : fastest.slice(0, 2).map(({ lap }) => lap);
-      const least = fastest[0]?.time_s ?? 0;
-      this.body.replaceChildren(...answer.laps.map((lap) => this.row(lap, least)));
-      this.choose();
-    } catch (error) {
-      if (!loading.signal.aborted)
-        this.note.set(error instanceof AnswerError ? error.message : String(error));
-    }
+    await this.loading.run(
+      async (signal) => this.list(await ask<LapsAnswer>("laps", this.asked(), signal), wanted),
+      (reason) => this.note.set(reason),
+    );
   }
 
   clear(): void {
-    this.loading?.abort();
+    this.loading.stop();
     this.undraw();
     this.laps = [];
     this.table.hidden = true;
@@ -92,8 +59,18 @@ export class LapsPanel {
   }
 
   private asked(): Record<string, string> {
-    const [from_us, to_us] = this.range.map((at) => String(Math.round(at * 1e6))) as [string, string];
-    return { robot: this.robot, from_us, to_us };
+    return { robot: this.robot, ...inUs(this.range) };
+  }
+
+  private list(answer: LapsAnswer, wanted: readonly number[]): void {
+    this.laps = answer.laps;
+    this.note.set(about(answer));
+    this.table.hidden = answer.laps.length === 0;
+    const known = wanted.filter((lap) => lap <= answer.laps.length).slice(0, MOST_PARTS);
+    const fastest = answer.laps.filter(({ complete }) => complete).sort((a, b) => a.time_s - b.time_s);
+    this.chosen = known.length > 0 ? known : fastest.slice(0, 2).map(({ lap }) => lap);
+    this.body.replaceChildren(...answer.laps.map((lap) => this.row(lap, fastest[0]?.time_s ?? 0)));
+    this.choose();
   }
 
   private row(lap: Lap, least: number): HTMLElement {
@@ -132,16 +109,8 @@ export class LapsPanel {
     const parts = chosen
       .flatMap((each) => this.laps.filter(({ lap }) => lap === each))
       .map(({ from_us, to_us }) => ({ robot, range: [from_us / 1e6, to_us / 1e6] as const }));
-    const few =
-      parts.length < 2
-        ? "Check two laps to compare them"
-        : parts.length > MOST_PARTS
-          ? `At most ${MOST_PARTS} laps can be compared`
-          : "";
     this.compare.hidden = this.laps.length === 0;
-    this.compare.textContent = few || `All fields of ${parts.length} laps`;
-    if (few) this.compare.removeAttribute("href");
-    else this.compare.href = route({ view: "compare", query: { runs: writeParts(parts), x: "distance" } });
+    offerComparison(this.compare, parts, "laps", `All fields of ${parts.length} laps`, { x: "distance" });
     void this.draw();
   }
 
@@ -150,97 +119,58 @@ export class LapsPanel {
     const [one, other] = this.chosen;
     this.undraw();
     if (one === undefined || other === undefined) return;
-    const loading = (this.loading = new AbortController());
-    try {
-      const delta = await ask<DeltaAnswer>(
-        "delta",
-        { ...this.asked(), one: String(one), other: String(other) },
-        loading.signal,
-      );
-      if (loading.signal.aborted) return;
-      this.undraw();
-      this.chart(
-        `Lap ${other} behind lap ${one}`,
-        "s",
-        3,
-        [{ label: "Delta", colour: "--accent" }],
-        [delta.delta_s],
-        delta,
-        true,
-      );
-      const curves = [one, other].map((lap, i) => ({
-        label: `Lap ${lap}`,
-        colour: `--${hue(i)}`,
-        dash: dash(i),
-      }));
-      if (delta.one_mps.some((speed) => speed !== null))
-        this.chart("Speed", "m/s", 2, curves, [delta.one_mps, delta.other_mps], delta, false);
-    } catch (error) {
-      if (!loading.signal.aborted)
-        this.note.set(error instanceof AnswerError ? error.message : String(error));
-    }
+    const asked = { ...this.asked(), one: String(one), other: String(other) };
+    await this.loading.run(
+      async (signal) => {
+        const delta = await ask<DeltaAnswer>("delta", asked, signal);
+        this.undraw();
+        this.chart(`Lap ${other} behind lap ${one}`, "s", 3, ["Delta"], [delta.delta_s], delta);
+        if (delta.one_mps.some((speed) => speed !== null)) {
+          const names = [`Lap ${one}`, `Lap ${other}`];
+          this.chart("Speed", "m/s", 2, names, [delta.one_mps, delta.other_mps], delta);
+        }
+      },
+      (reason) => this.note.set(reason),
+    );
   }
 
   private chart(
     title: string,
     unit: string,
     digits: number,
-    curves: readonly Curve[],
-    columns: readonly (readonly (number | null)[])[],
-    { places, unit: of }: DeltaAnswer,
-    zero: boolean,
+    names: readonly string[],
+    columns: Columns,
+    { places, unit: along }: DeltaAnswer,
   ): void {
-    const readings = columns.map(() => new Text("num"));
-    const plot = el("div", { class: "plot" });
-    const values = readings.map(({ node }, i) =>
-      el(
-        "p",
-        { class: "reading" },
-        ...(curves.length > 1
-          ? [el("span", { class: `key ${hue(i)}` }), el("span", { class: "label" }, curves[i]!.label)]
-          : []),
-        node,
-        el("span", { class: "unit" }, unit),
-      ),
-    );
-    this.charts.append(
-      el(
-        "section",
-        { class: "panel", "aria-label": title },
-        el("header", {}, el("h3", {}, title), ...values),
-        plot,
-      ),
-    );
+    const single = names.length === 1;
+    const curves = names.map((label, i) => ({
+      label,
+      colour: single ? "--accent" : `--${hue(i)}`,
+      dash: dash(i),
+    }));
     const read = (index: number | null): void =>
-      readings.forEach((text, i) => text.set(number(columns[i]![index ?? places.length - 1] ?? NaN, digits)));
-    read(null);
-    const about = { title, write: (value: number) => `${number(value, digits)} ${unit}` };
-    const data = [[...places], ...columns.map((column) => [...column])] as [number[], ...(number | null)[][]];
-    this.drawn.push(
-      new RangeChart(
-        plot,
-        { about, curves, sync: SYNC, hole_s: Infinity, unit: of, zero, onCursor: read },
-        data,
-        [0, places.at(-1) ?? 1],
-      ),
+      drawn.read(columns.map((column) => number(column[index ?? places.length - 1] ?? NaN, digits)));
+    const drawn = new LinesPanel(
+      { title, unit, digits, along, curves, sync: SYNC, hole_s: Infinity, zero: single, onCursor: read },
+      places,
+      columns,
+      [0, places.at(-1) ?? 1],
     );
+    read(null);
+    this.charts.append(drawn.node);
+    this.drawn.push(drawn);
   }
 
   private undraw(): void {
     for (const chart of this.drawn) chart.destroy();
     this.drawn = [];
-    this.charts.replaceChildren();
   }
 }
 
 function about({ laps, method, confidence, reason, estimates }: LapsAnswer): string {
-  if (laps.length === 0) return `${reason.charAt(0).toUpperCase()}${reason.slice(1)}.`;
-  const told = (["lap_best_s", "lap_mean_s", "lap_energy_wh_per_km"] as const).flatMap((name) =>
-    estimates[name]
-      ? [
-          `${{ lap_best_s: "best", lap_mean_s: "mean", lap_energy_wh_per_km: "energy" }[name]} ${words(estimates[name])}`,
-        ]
-      : [],
+  if (laps.length === 0) return `${capital(reason)}.`;
+  const figures = Object.entries(FIGURES).flatMap(([name, word]) =>
+    estimates[name] ? [`${word} ${words(estimates[name])}`] : [],
   );
-  return `${METHODS[method] ?? method}, ${number(confidence * 100, 0)} % sure: ${told.join(", ")}.`;
+  return `${METHODS[method] ?? method}, ${number(confidence * 100, 0)} % sure: ${figures.join(", ")}.`;
 }

@@ -61,23 +61,17 @@ export class Parameters {
     const changed = findings.find(
       ({ subject, start_us }) => subject.startsWith(name) && start_us === having.at(-1)!.from_us,
     );
+    const about = { "aria-label": meaning, "data-parameter": name, "data-severity": changed?.severity ?? "" };
     const node = el(
       "section",
-      {
-        class: "panel parameter",
-        "aria-label": meaning,
-        "data-parameter": name,
-        "data-severity": changed?.severity ?? "",
-      },
+      { class: "panel parameter", ...about },
       el("h4", {}, capital(meaning)),
       el("p", { class: "num" }, words(newest)),
     );
     host.append(node);
     if (having.length < 2) {
-      node.append(
-        intervalBar(newest, changed?.baseline ?? null),
-        el("p", { class: "note" }, "one drive so far"),
-      );
+      const note = el("p", { class: "note" }, "one drive so far");
+      node.append(intervalBar(newest, changed?.baseline ?? null), note);
       return;
     }
     const [factor, unit] = scale(newest.unit, newest.value);
@@ -85,23 +79,17 @@ export class Parameters {
       having.map(({ estimates }) => estimates[name]![end] * factor);
     const times = having.map(({ from_us }) => from_us / 1e6);
     const plot = el("div", { class: "plot" });
-    node.append(
-      plot,
-      el(
-        "p",
-        { class: "note" },
-        `${having.length} drives; band = 90 % interval${worse === "either" ? "" : worse === "up" ? "; higher is worse" : "; lower is worse"}`,
-      ),
-    );
+    const bad = { either: "", up: "; higher is worse", down: "; lower is worse" }[worse];
+    node.append(plot, el("p", { class: "note" }, `${having.length} drives; band = 90 % interval${bad}`));
     const [first, last] = [times[0]!, times.at(-1)!];
     const around = Math.max((last - first) * MARGIN, 60);
     const places = digits(newest.low * factor, newest.high * factor);
-    const about = { title: meaning, write: (value: number) => `${number(value, places)} ${unit}` };
+    const write = (value: number): string => `${number(value, places)} ${unit}`;
     const curves = [{ label: meaning, colour: "--accent", points: true }];
     this.charts.push(
       new RangeChart(
         plot,
-        { about, curves, hole_s: 3650 * DAY_S, band: true },
+        { about: { title: meaning, write }, curves, hole_s: 3650 * DAY_S, band: true },
         [times, column("value"), column("low"), column("high")],
         [first - around, last + around],
       ),

@@ -2,7 +2,8 @@
 // next to nothing without one. A lease ends by itself, so a page that dies costs no more than the rest of it.
 
 import { type Config, VIEW_LEASE_MS, VIEW_RENEW_S } from "../base/contract";
-import { AnswerError, act } from "../server/answers";
+import { newName } from "../base/dom";
+import { act, words } from "../server/answers";
 import type { Lease } from "./worker_messages";
 
 /** The rate of a card among others, and of a value beside the past. */
@@ -25,9 +26,7 @@ export class Viewing {
   private readonly connected: boolean;
   /** Why the newest lease was not sent. */
   error = "";
-  private readonly viewer = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) =>
-    b.toString(16).padStart(2, "0"),
-  ).join("");
+  private readonly viewer = newName();
   private looks = NONE;
   private held = NONE;
 
@@ -96,6 +95,6 @@ export class Viewing {
         // A car that is looked at again meanwhile may have heard of it before it heard of the end.
         if (lease_ms === 0 && robots.some((robot) => this.held.has(robot))) this.renew();
       })
-      .catch((error: unknown) => (this.error = error instanceof AnswerError ? error.message : String(error)));
+      .catch((error: unknown) => (this.error = words(error)));
   }
 }

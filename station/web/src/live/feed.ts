@@ -2,6 +2,7 @@
 
 import { now } from "../base/clock";
 import type { Config, FieldTable } from "../base/contract";
+import { newName } from "../base/dom";
 import { keep, kept } from "../base/kept";
 import type { FromWorker, Lease, LinkState, ToWorker } from "../link/worker_messages";
 import type { Fleet } from "./fleet";
@@ -52,7 +53,7 @@ export class Feed {
 
 /** An id for this browser: PubNub bills by users, and a reload must not be a new user. */
 function userId(): string {
-  const fresh = `page-${Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("")}`;
+  const fresh = `page-${newName()}`;
   const known = kept("user");
   if (known && /^page-[0-9a-f]{16}$/.test(known)) return known;
   // Without storage, every visit is a new user.

@@ -9,14 +9,39 @@ export const KEPT_KEY = "key";
 
 export class AnswerError extends Error {}
 
+/** What a viewer is told of a failure. */
+export const words = (error: unknown): string =>
+  error instanceof AnswerError ? error.message : String(error);
+
+/** Of several tasks in a row only the newest counts: an older one is ended, and its failure says nothing. */
+export class Latest {
+  private current = new AbortController();
+
+  stop(): void {
+    this.current.abort();
+  }
+
+  async run(work: (signal: AbortSignal) => Promise<void>, failed: (reason: string) => void): Promise<void> {
+    this.stop();
+    const { signal } = (this.current = new AbortController());
+    try {
+      await work(signal);
+    } catch (error) {
+      if (!signal.aborted) failed(words(error));
+    }
+  }
+}
+
 type Parameters = Readonly<Record<string, string>>;
 
 /** Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. */
-export function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
-  return laneOf(name).run(
+export async function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
+  const answer = await laneOf(name).run(
     async (end) => (await (await get(`${name}.json`, parameters, end)).json()) as T,
     signal,
   );
+  signal?.throwIfAborted();
+  return answer;
 }
 
 /**

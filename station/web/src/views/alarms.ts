@@ -1,18 +1,21 @@
 // The alarms: what is wrong, since when, what to do, where to look; and who has seen it.
 
 import type { AlarmEntry, Config, Rejected, RejectedAnswer } from "../base/contract";
-import { el, marked, Text } from "../base/dom";
+import { button, el, marked, Text, table, unserved } from "../base/dom";
 import { capital, when } from "../base/format";
 import { keep, kept } from "../base/kept";
+import { writeTime } from "../base/range";
 import { route } from "../base/route";
 import type { Alarms, CarState, Raised } from "../live/alarms";
-import { AnswerError, ask } from "../server/answers";
-import type { Services, View } from "./view";
+import { ask, words } from "../server/answers";
+import { type Services, type View, viewNode } from "./view";
 
 // The part of a car's past that a link shows. A cloud's alarm goes off minutes after its cause.
 const BEFORE_S = 60;
 const CLOUD_BEFORE_S = 300;
 const AFTER_S = 60;
+const UNSERVED =
+  "This page was put on the web as it is: it sees only what the cars send. Run `iort dashboard` for the cloud's alarms.";
 const STATES = { ALARM: "raised", INSUFFICIENT_DATA: "no data yet", OK: "quiet" } as const;
 
 export class AlarmsView implements View {
@@ -41,50 +44,25 @@ export class AlarmsView implements View {
     this.alarms = alarms;
     this.name.value = kept("name") ?? "";
     this.name.addEventListener("change", () => keep("name", this.name.value));
-    const told = el(
-      "p",
-      { class: "unserved" },
-      "This page was put on the web as it is: it sees only what the cars send. Run ",
-      el("code", {}, "iort dashboard"),
-      " for the cloud's alarms.",
-    );
+    const head = ["Alarm", "Meaning", "State", "What to do"];
     const others = el(
       "details",
       { class: "panel quiet" },
       el("summary", {}, this.count.node),
-      el(
-        "div",
-        { class: "log" },
-        el(
-          "table",
-          {},
-          el(
-            "thead",
-            {},
-            el(
-              "tr",
-              {},
-              ...["Alarm", "Meaning", "State", "What to do"].map((text) => el("th", { scope: "col" }, text)),
-            ),
-          ),
-          this.quiet,
-        ),
-      ),
+      el("div", { class: "log" }, table(head, this.quiet)),
     );
-    this.node = el(
-      "article",
-      { class: "alarms-view" },
-      el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "Alarms"), this.note.node),
-      ...(config.answers
-        ? [el("p", { class: "range" }, el("label", {}, "acknowledge as ", this.name))]
-        : [told]),
+    const named = el("p", { class: "range" }, el("label", {}, "acknowledge as ", this.name));
+    this.node = viewNode(
+      "alarms-view",
+      "Alarms",
+      [this.note.node],
+      config.answers ? named : unserved(UNSERVED),
       this.none,
       this.list,
       ...(config.answers ? [others] : []),
     );
   }
 
-  /** Update what changes; an alarm that has not changed keeps its node, and with it the focus. */
   title(): string {
     return "Alarms · iort";
   }
@@ -92,6 +70,7 @@ export class AlarmsView implements View {
   /** The alarms are the same, whatever the address says. */
   show(): void {}
 
+  /** Update what changes; an alarm that has not changed keeps its node, and with it the focus. */
   clock(now: number): void {
     const { entries, error, askedAt, user } = this.alarms;
     this.name.placeholder = user;
@@ -121,7 +100,7 @@ export class AlarmsView implements View {
       this.rejected = await ask<RejectedAnswer>("rejected", {});
       this.failure = "";
     } catch (error) {
-      this.failure = error instanceof AnswerError ? error.message : String(error);
+      this.failure = words(error);
     }
   }
 
@@ -132,19 +111,13 @@ export class AlarmsView implements View {
     if (before?.drawn === drawn) return before.node;
     const { key, meaning, advice, entry, cars, fresh } = alarm;
     const seen = entry?.acknowledged;
-    const button = el("button", { type: "button", class: "tool" }, "Acknowledge");
-    button.addEventListener("click", () => entry && void this.acknowledge(entry, button));
+    const acknowledge = button("Acknowledge", () => entry && void this.acknowledge(entry, acknowledge));
     const since = entry?.state === "ALARM" ? `raised since ${when(entry.since_s)}` : "raised by live values";
+    const beside = [el("code", { class: "note" }, key), el("span", { class: "note" }, since)];
     const node = el(
       "li",
       { class: "panel alarm", "data-alarm": key, "data-fresh": String(fresh) },
-      el(
-        "header",
-        {},
-        el("h3", {}, capital(meaning)),
-        el("code", { class: "note" }, key),
-        el("span", { class: "note" }, since),
-      ),
+      el("header", {}, el("h3", {}, capital(meaning)), ...beside),
       el("p", {}, el("b", {}, "What to do: "), ...marked(advice)),
       ...(cars.length > 0 ? [el("ul", { class: "cases" }, ...cars.map(live))] : []),
       ...(entry?.state === "ALARM" ? evidence(entry, messages) : []),
@@ -154,7 +127,7 @@ export class AlarmsView implements View {
         ...(seen
           ? [`Acknowledged by ${seen.by}, ${when(seen.at_s)}.`, ...(fresh ? [" A car joined since."] : [])]
           : []),
-        ...(entry?.state === "ALARM" && fresh ? [button] : []),
+        ...(entry?.state === "ALARM" && fresh ? [acknowledge] : []),
       ),
     );
     this.cards.set(key, { drawn, node });
@@ -167,7 +140,7 @@ export class AlarmsView implements View {
       await this.alarms.acknowledge(entry, this.name.value);
       this.failure = "";
     } catch (error) {
-      this.failure = error instanceof AnswerError ? error.message : String(error);
+      this.failure = words(error);
       button.disabled = false;
     }
   }
@@ -178,14 +151,14 @@ function evidence(
   { evidence, robots, named, since_s }: AlarmEntry,
   messages: RejectedAnswer | undefined,
 ): HTMLElement[] {
-  if (evidence === "logs")
-    return [
-      el(
-        "p",
-        {},
-        el("a", { class: "tool", href: route({ view: "cloudwatch" }) }, "Newest warnings and errors"),
-      ),
-    ];
+  if (evidence === "logs") {
+    const link = el(
+      "a",
+      { class: "tool", href: route({ view: "cloudwatch" }) },
+      "Newest warnings and errors",
+    );
+    return [el("p", {}, link)];
+  }
   if (evidence === "quarantine") {
     if (!messages) return [];
     const { rejected, found } = messages;
@@ -201,16 +174,8 @@ function evidence(
   const links = robots.map((robot) =>
     el("li", {}, past(robot, since_s - CLOUD_BEFORE_S, since_s + AFTER_S, robot)),
   );
-  return [
-    el(
-      "p",
-      {},
-      named
-        ? "The cars that an alert has named, at that time:"
-        : "The cars that were connected, at that time:",
-    ),
-    el("ul", { class: "cases across" }, ...links),
-  ];
+  const which = named ? "that an alert has named" : "that were connected";
+  return [el("p", {}, `The cars ${which}, at that time:`), el("ul", { class: "cases across" }, ...links)];
 }
 
 function live({ robot, text, since }: CarState): HTMLElement {
@@ -240,12 +205,8 @@ function message({ id, robot, topic, source, reason, last_s, seen }: Rejected): 
 
 /** A link to a car's past. */
 function past(robot: string, from_s: number, to_s: number, text: string): HTMLElement {
-  const at = (seconds: number): string => new Date(seconds * 1000).toISOString();
-  return el(
-    "a",
-    { class: "tool", href: route({ view: "history", robot, query: { from: at(from_s), to: at(to_s) } }) },
-    text,
-  );
+  const query = { from: writeTime(from_s), to: writeTime(to_s) };
+  return el("a", { class: "tool", href: route({ view: "history", robot, query }) }, text);
 }
 
 function row({ key, meaning, state, since_s, advice }: AlarmEntry): HTMLElement {

@@ -1,21 +1,23 @@
 // CloudWatch's deployed dashboards, drawn from the cloud's metrics.
 
-import type { Alarm, Config, Dashboard, Series, Widget } from "../base/contract";
-import { el, Text } from "../base/dom";
+import type { Alarm, Config, Dashboard, DashboardsAnswer, Series, Widget } from "../base/contract";
+import { choices, el, panel, Text, unserved } from "../base/dom";
 import { NOTHING, number, when } from "../base/format";
 import { route } from "../base/route";
 import { type Curve, RangeChart } from "../charts/range_chart";
-import { AnswerError, ask } from "../server/answers";
+import { ask, Latest } from "../server/answers";
 import { LogTable } from "../widgets/log_table";
-import type { Services, View } from "./view";
+import { type Services, type View, viewNode } from "./view";
 
 const REFRESH_S = 30;
 const RANGES = [
-  ["15 min", 15],
-  ["1 h", 60],
-  ["3 h", 180],
-  ["24 h", 1440],
+  ["15", "15 min"],
+  ["60", "1 h"],
+  ["180", "3 h"],
+  ["1440", "24 h"],
 ] as const;
+const UNSERVED =
+  "This page was put on the web as it is, and cannot read CloudWatch. Run `iort dashboard`, or look at them in the AWS console.";
 const COLOURS = ["--hue-1", "--hue-2", "--hue-3", "--hue-4", "--hue-5", "--hue-6"];
 const DASHES = [undefined, [6, 3], [2, 3]] as const;
 
@@ -23,17 +25,16 @@ export class CloudWatchView implements View {
   readonly node: HTMLElement;
   private readonly config: Config;
   private readonly choice = el("select", { id: "dashboard", name: "dashboard" });
-  private readonly range = el("select", { id: "minutes", name: "minutes" });
+  private readonly range = el("select", { id: "minutes", name: "minutes" }, ...choices(RANGES));
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly grid = el("div", { class: "widgets" });
   private charts: RangeChart[] = [];
   private logs = new Map<string, LogTable>();
   private timer: number | undefined;
-  private loading: AbortController | undefined;
+  private readonly loading = new Latest();
 
   constructor({ config }: Services) {
     this.config = config;
-    this.range.append(...RANGES.map(([label, minutes]) => el("option", { value: String(minutes) }, label)));
     this.range.value = "60";
     for (const each of [this.choice, this.range]) each.addEventListener("change", () => void this.load());
     const form = el(
@@ -42,19 +43,8 @@ export class CloudWatchView implements View {
       el("label", {}, "dashboard ", this.choice),
       el("label", {}, "last ", this.range),
     );
-    const told = el(
-      "p",
-      { class: "unserved" },
-      "This page was put on the web as it is, and cannot read CloudWatch. Run ",
-      el("code", {}, "iort dashboard"),
-      ", or look at them in the AWS console.",
-    );
-    this.node = el(
-      "article",
-      { class: "cloudwatch" },
-      el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "CloudWatch"), this.note.node),
-      ...(config.answers ? [form, this.grid] : [told]),
-    );
+    const served = config.answers ? [form, this.grid] : [unserved(UNSERVED)];
+    this.node = viewNode("cloudwatch", "CloudWatch", [this.note.node], ...served);
   }
 
   title(): string {
@@ -75,43 +65,35 @@ export class CloudWatchView implements View {
 
   private rest(): void {
     window.clearInterval(this.timer);
-    this.loading?.abort();
+    this.loading.stop();
   }
 
   private async find(): Promise<void> {
     this.note.set("Loading …");
-    try {
-      const { dashboards } = await ask<{ dashboards: string[] }>("dashboards", {});
-      const before = this.choice.value;
-      this.choice.replaceChildren(...dashboards.map((name) => el("option", { value: name }, name)));
-      if (dashboards.includes(before)) this.choice.value = before;
-      if (dashboards.length === 0) this.note.set("No dashboard is deployed.");
-      else await this.load();
-    } catch (error) {
-      this.note.set(error instanceof AnswerError ? error.message : String(error));
-    }
+    await this.loading.run(
+      async (signal) => {
+        const { dashboards } = await ask<DashboardsAnswer>("dashboards", {}, signal);
+        const before = this.choice.value;
+        this.choice.replaceChildren(...choices(dashboards));
+        if (dashboards.includes(before)) this.choice.value = before;
+        if (dashboards.length === 0) this.note.set("No dashboard is deployed.");
+        else void this.load();
+      },
+      (reason) => this.note.set(reason),
+    );
   }
 
   private async load(): Promise<void> {
     if (!this.choice.value) return;
-    this.loading?.abort();
-    const loading = new AbortController();
-    this.loading = loading;
-    try {
-      const dashboard = await ask<Dashboard>(
-        "dashboard",
-        { name: this.choice.value, minutes: this.range.value },
-        loading.signal,
-      );
-      if (loading.signal.aborted) return;
-      this.draw(dashboard);
-      // The dashboard ends with the current minute.
-      const at = Date.now() / 1000;
-      this.note.set(`as of ${when(at)}, again every ${REFRESH_S} s`);
-    } catch (error) {
-      if (!loading.signal.aborted)
-        this.note.set(error instanceof AnswerError ? error.message : String(error));
-    }
+    const asked = { name: this.choice.value, minutes: this.range.value };
+    await this.loading.run(
+      async (signal) => {
+        this.draw(await ask<Dashboard>("dashboard", asked, signal));
+        // The dashboard ends with the current minute.
+        this.note.set(`as of ${when(Date.now() / 1000)}, again every ${REFRESH_S} s`);
+      },
+      (reason) => this.note.set(reason),
+    );
   }
 
   private draw({ name, widgets, from_s, to_s }: Dashboard): void {
@@ -120,25 +102,21 @@ export class CloudWatchView implements View {
     const logs = new Map<string, LogTable>();
     const ordered = [...widgets].sort((a, b) => a.y - b.y || a.x - b.x);
     this.grid.replaceChildren(
-      ...ordered
-        .map((widget) => {
-          const [node, plot] = frame(widget);
-          node.style.setProperty("--across", String(widget.width));
-          node.style.setProperty("--down", String(widget.height));
-          return [node, plot, widget] as const;
-        })
-        .map(([node, plot, widget]) => {
-          if (plot) queueMicrotask(() => this.charts.push(chart(plot, widget, [from_s, to_s])));
-          if (widget.kind === "log") {
-            const asked = { name, widget: String(widget.number), minutes: this.range.value };
-            const key = JSON.stringify(asked);
-            const log = this.logs.get(key) ?? new LogTable(asked, widget.title);
-            logs.set(key, log);
-            node.append(log.node);
-            void log.refresh();
-          }
-          return node;
-        }),
+      ...ordered.map((widget) => {
+        const [node, plot] = frame(widget);
+        node.style.setProperty("--across", String(widget.width));
+        node.style.setProperty("--down", String(widget.height));
+        if (plot) queueMicrotask(() => this.charts.push(chart(plot, widget, [from_s, to_s])));
+        if (widget.kind === "log") {
+          const asked = { name, widget: String(widget.number), minutes: this.range.value };
+          const key = JSON.stringify(asked);
+          const log = this.logs.get(key) ?? new LogTable(asked, widget.title);
+          logs.set(key, log);
+          node.append(log.node);
+          void log.refresh();
+        }
+        return node;
+      }),
     );
     for (const [key, log] of this.logs) if (!logs.has(key)) log.stop();
     this.logs = logs;
@@ -148,57 +126,33 @@ export class CloudWatchView implements View {
 function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
   if (widget.kind === "text")
     return [el("section", { class: "widget words" }, ...markdown(widget.text)), undefined];
-  const heading = el("header", {}, el("h3", { title: widget.title }, widget.title));
-  const node = el(
-    "section",
-    { class: "panel widget", "aria-label": widget.title, "data-widget": widget.title },
-    heading,
-  );
-  if (widget.kind === "log") return [node, undefined];
-  if (widget.kind === "other") {
-    node.append(el("p", { class: "note" }, widget.text));
-    return [node, undefined];
-  }
-  if (widget.kind === "alarms") {
-    const raised = widget.alarms.filter(({ state }) => state === "ALARM").length;
-    heading.append(
-      el(
-        "span",
-        { class: "note" },
-        raised === 0
-          ? `none of ${widget.alarms.length} raised`
-          : `${raised} of ${widget.alarms.length} raised`,
-      ),
-    );
-    node.append(el("ul", { class: "alarms" }, ...[...widget.alarms].sort(byUrgency).map(alarm)));
-    return [node, undefined];
-  }
-  const any = widget.series.some((series) => series.values.length > 0);
-  const legend = el(
-    "ul",
-    { class: "legend" },
-    ...widget.series.map((series, i) =>
-      el(
-        "li",
-        { "data-series": series.label },
-        el("span", { class: `key ${COLOURS[i % COLOURS.length]!.slice(2)}` }),
-        series.label,
-        " ",
-        el(
-          "b",
-          { class: "num" },
-          series.values.length > 0 ? number(series.values.at(-1)!, digits(series.values.at(-1)!)) : NOTHING,
-        ),
-      ),
-    ),
-  );
-  if (widget.kind === "number") {
-    node.append(legend);
-    return [node, undefined];
-  }
+  const { title, kind, alarms, series } = widget;
+  const raised = alarms.filter(({ state }) => state === "ALARM").length;
+  const count = `${raised === 0 ? "none" : raised} of ${alarms.length} raised`;
+  const node = panel(title, "widget", kind === "alarms" ? [el("span", { class: "note" }, count)] : []);
+  node.dataset.widget = node.querySelector("h3")!.title = title;
+  const legend = el("ul", { class: "legend" }, ...series.map(legendItem));
+  if (kind === "other") node.append(el("p", { class: "note" }, widget.text));
+  if (kind === "alarms")
+    node.append(el("ul", { class: "alarms" }, ...[...alarms].sort(byUrgency).map(alarm)));
+  if (kind === "number") node.append(legend);
+  if (kind !== "series") return [node, undefined];
+  const any = series.some(({ values }) => values.length > 0);
   const plot = el("div", { class: "plot", ...(any ? {} : { "data-empty": "no data in this range" }) });
   node.append(plot, legend);
   return [node, plot];
+}
+
+function legendItem({ label, values }: Series, i: number): HTMLElement {
+  const newest = values.at(-1);
+  return el(
+    "li",
+    { "data-series": label },
+    el("span", { class: `key ${COLOURS[i % COLOURS.length]!.slice(2)}` }),
+    label,
+    " ",
+    el("b", { class: "num" }, newest === undefined ? NOTHING : number(newest, digits(newest))),
+  );
 }
 
 const STATES = { ALARM: "raised", INSUFFICIENT_DATA: "no data yet", OK: "quiet" } as const;

@@ -1,39 +1,42 @@
 // Two to six runs, laps or robots on one axis: the time since each began, or the distance since then.
 
 import type { Config, FieldTable, StreamsAnswer } from "../base/contract";
-import { el, Text } from "../base/dom";
+import { button, choices, el, Text, unserved } from "../base/dom";
 import { age, clockTime, number, when, zone } from "../base/format";
 import { type Range, same, writeTime } from "../base/range";
 import { MOST_PARTS, type Part, type RouteTo, readParts, route, setAddress, writeParts } from "../base/route";
+import { key } from "../charts/lines_panel";
 import { AddPart } from "../history/add_part";
 import type { Axis } from "../history/align";
-import { CompareCharts, hue } from "../history/compare_charts";
+import { FieldCharts } from "../history/field_charts";
 import { NoDistance, Parts } from "../history/parts";
-import { AnswerError, ask } from "../server/answers";
-import type { Services, View } from "./view";
+import { ask, Latest } from "../server/answers";
+import { type Services, type View, viewNode } from "./view";
 
 const SETTLED_MS = 200;
-const AXES: Readonly<Record<Axis, string>> = { time: "Time since the start", distance: "Distance" };
+const AXES = [
+  ["time", "Time since the start"],
+  ["distance", "Distance"],
+] as const;
+const USUAL = ["speed", "current_motor", "duty_cycle", "voltage_input"];
+const MOST_CHARTS = 8;
+const UNSERVED =
+  "This page was put on the web as it is, and cannot read the tables. To compare runs, run `iort dashboard`.";
 
 export class CompareView implements View<RouteTo<"compare">> {
   readonly node: HTMLElement;
   private readonly config: Config;
   private readonly table: FieldTable;
   private readonly stream = el("select", { id: "compare-stream" });
-  private readonly axis = el(
-    "select",
-    { id: "compare-axis" },
-    ...Object.entries(AXES).map(([value, label]) => el("option", { value }, label)),
-  );
-  private readonly out = el(
-    "button",
-    { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" },
-    "Zoom out",
-  );
+  private readonly axis = el("select", { id: "compare-axis" }, ...choices(AXES));
+  private readonly out = button("Zoom out", () => this.back(), {
+    hidden: "",
+    title: "Also: a double click on a chart",
+  });
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly at = new Text("num");
   private readonly list = el("ul", { class: "parts" });
-  private readonly charts: CompareCharts;
+  private readonly charts: FieldCharts;
   private readonly add: AddPart;
   private readonly loader: Parts;
   private parts: readonly Part[] = [];
@@ -43,7 +46,7 @@ export class CompareView implements View<RouteTo<"compare">> {
   private extent: Range = [0, 1];
   private zooms: Range[] = [];
   private zoom: Range | undefined;
-  private loading: AbortController | undefined;
+  private readonly loading = new Latest();
   private settling: number | undefined;
 
   constructor({ config, table, fleet }: Services) {
@@ -51,60 +54,47 @@ export class CompareView implements View<RouteTo<"compare">> {
     this.table = table;
     this.loader = new Parts(table, fleet);
     this.add = new AddPart(fleet, (part) => this.include(part));
-    const hands = {
-      zoom: (to: Range) => this.go(to),
-      move: (to: Range, upright: boolean) => this.move(to, upright),
-      back: () => this.back(),
-      pick: () => undefined,
-    };
-    this.charts = new CompareCharts(
-      (field) => this.loader.spec(field, this.stream.value, this.parts),
-      hands,
-      (index) => index !== null && this.read(index),
-      () => {
+    this.charts = new FieldCharts({
+      spec: (field) => this.loader.spec(field, this.stream.value, this.parts),
+      hands: {
+        zoom: (to) => this.go(to),
+        move: (to, upright) => this.move(to, upright),
+        back: () => this.back(),
+        pick: () => undefined,
+      },
+      onCursor: (index) => index !== null && this.read(index),
+      onFields: () => {
         this.wanted = this.charts.fields;
         this.write();
       },
-    );
+      sync: "compare",
+      usual: USUAL,
+      most: MOST_CHARTS,
+    });
     this.stream.addEventListener("change", () => this.restart());
     this.axis.addEventListener("change", () => this.restart());
-    this.out.addEventListener("click", () => this.back());
     const form = el(
       "div",
       { class: "range" },
       el("label", {}, "stream ", this.stream),
       el("label", {}, "over ", this.axis),
     );
-    const told = el(
-      "p",
-      { class: "unserved" },
-      "This page was put on the web as it is, and cannot read the tables. To compare runs, run ",
-      el("code", {}, "iort dashboard"),
-      ".",
-    );
-    const served = [
-      form,
-      this.list,
-      this.add.node,
-      el("div", { class: "history-status" }, this.note.node, this.at.node, this.out),
-      this.charts.chips,
-      this.charts.node,
-    ];
-    this.node = el(
-      "article",
-      { class: "history compare-view" },
-      el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "Compare")),
-      ...(config.answers ? served : [told]),
+    const status = el("div", { class: "history-status" }, this.note.node, this.at.node, this.out);
+    const served = [form, this.list, this.add.node, status, this.charts.chips, this.charts.node];
+    this.node = viewNode(
+      "history compare-view",
+      "Compare",
+      [],
+      ...(config.answers ? served : [unserved(UNSERVED)]),
     );
   }
 
-  /** Show what an address says; undefined when the viewer leaves. */
   title(): string {
     return "Compare · iort";
   }
 
   leave(): void {
-    this.loading?.abort();
+    this.loading.stop();
   }
 
   show({ query = {} }: RouteTo<"compare">): void {
@@ -127,9 +117,7 @@ export class CompareView implements View<RouteTo<"compare">> {
     try {
       const { streams } = await ask<StreamsAnswer>("streams", { robot });
       const chosen = this.stream.value;
-      this.stream.replaceChildren(
-        ...[...new Set([...streams, chosen])].map((name) => el("option", { value: name }, name)),
-      );
+      this.stream.replaceChildren(...choices([...new Set([...streams, chosen])]));
       this.stream.value = chosen;
     } catch {
       // The request for the samples says why.
@@ -196,8 +184,6 @@ export class CompareView implements View<RouteTo<"compare">> {
   }
 
   private async load(): Promise<void> {
-    this.loading?.abort();
-    const loading = (this.loading = new AbortController());
     const { parts, zoom } = this;
     const stream = this.stream.value;
     this.showParts();
@@ -206,39 +192,42 @@ export class CompareView implements View<RouteTo<"compare">> {
     this.note.set(
       parts.length < 2 ? `Add ${parts.length === 0 ? "two runs" : "another run"} to compare.` : "Loading …",
     );
-    try {
-      const { samples, archived, extent, compared } = await this.loader.load(
-        parts,
-        stream,
-        this.axis.value as Axis,
-        zoom,
-        loading.signal,
-      );
-      if (loading.signal.aborted) return;
-      this.extent = extent;
-      [this.grid, this.unit] = [compared.grid, compared.unit];
-      this.charts.set(compared, shortly(parts), zoom ?? extent, this.wanted);
-      if (parts.length >= 2)
-        this.note.set(
-          samples === 0
-            ? "Nothing was stored in these ranges."
-            : `${number(samples)} samples${archived ? ", some from the archive" : ""}.`,
-        );
-      this.read(0);
-    } catch (error) {
-      if (loading.signal.aborted) return;
-      if (error instanceof NoDistance) {
-        this.axis.value = "time";
-        await this.load();
-        this.note.set(
-          `${error.message} has no distance in ${stream}: it needs a position, or the tachometer and the car's speed_to_erpm_gain. Shown over time.`,
-        );
-        return;
-      }
+    await this.loading.run(
+      async (signal) => {
+        try {
+          await this.draw(parts, stream, zoom, signal);
+        } catch (error) {
+          if (!(error instanceof NoDistance)) throw error;
+          this.axis.value = "time";
+          await this.draw(parts, stream, undefined, signal);
+          this.note.set(
+            `${error.message} has no distance in ${stream}: it needs a position, or the tachometer and the car's speed_to_erpm_gain. Shown over time.`,
+          );
+        }
+      },
+      (reason) => this.note.set(reason),
+    );
+  }
+
+  private async draw(
+    parts: readonly Part[],
+    stream: string,
+    zoom: Range | undefined,
+    signal: AbortSignal,
+  ): Promise<void> {
+    const compared = await this.loader.load(parts, stream, this.axis.value as Axis, zoom, signal);
+    signal.throwIfAborted();
+    const { samples, archived, extent, ...charted } = compared;
+    this.extent = extent;
+    [this.grid, this.unit] = [charted.x, charted.unit!];
+    this.charts.set({ ...charted, names: shortly(parts) }, zoom ?? extent, this.wanted);
+    if (parts.length >= 2)
       this.note.set(
-        error instanceof AnswerError ? error.message : `The answer could not be read: ${String(error)}`,
+        samples === 0
+          ? "Nothing was stored in these ranges."
+          : `${number(samples)} samples${archived ? ", some from the archive" : ""}.`,
       );
-    }
+    this.read(0);
   }
 
   private showParts(): void {
@@ -246,27 +235,17 @@ export class CompareView implements View<RouteTo<"compare">> {
     this.list.replaceChildren(
       ...this.parts.map((part, i) => {
         const [from, to] = part.range;
-        const remove = el(
-          "button",
-          { type: "button", class: "close", "aria-label": `Remove ${named(part)}` },
-          "×",
-        );
-        remove.addEventListener("click", () => this.choose(this.parts.filter((_, other) => other !== i)));
-        const link = el(
-          "a",
-          {
-            href: route({
-              view: "history",
-              robot: part.robot,
-              query: { stream, from: writeTime(from), to: writeTime(to) },
-            }),
-          },
-          named(part),
-        );
+        const others = this.parts.filter((_, other) => other !== i);
+        const remove = button("×", () => this.choose(others), {
+          class: "close",
+          "aria-label": `Remove ${named(part)}`,
+        });
+        const query = { stream, from: writeTime(from), to: writeTime(to) };
+        const link = el("a", { href: route({ view: "history", robot: part.robot, query }) }, named(part));
         return el(
           "li",
           { class: "panel" },
-          el("span", { class: `key ${hue(i)}${i % 2 ? " dashed" : ""}` }),
+          key(i),
           link,
           el("span", { class: "note" }, age(to - from)),
           remove,

@@ -1,18 +1,18 @@
 // A car's past: a range from the cloud's table, to zoom into, to play, to save, and to compare with the live values.
 
-import type { Config, FieldTable, HistoryAnswer, RunsAnswer } from "../base/contract";
-import { el, Text } from "../base/dom";
+import type { Config, FieldTable, HistoryAnswer, RunsAnswer, StreamsAnswer } from "../base/contract";
+import { el, Text, unserved } from "../base/dom";
 import { age, number, when } from "../base/format";
-import { LEAST_S, type Range, readRange, readTime, rounded, same, writeTime } from "../base/range";
+import { inUs, LEAST_S, type Range, readRange, readTime, rounded, same, writeTime } from "../base/range";
 import { type Query, type RouteTo, route, setAddress } from "../base/route";
 import { fromArchive, unread } from "../history/origin";
 import { RangeForm } from "../history/range_form";
 import { Result } from "../history/result";
 import { RunsList } from "../history/runs_list";
 import { GLANCE_HZ, type Looks } from "../link/viewing";
-import { AnswerError, ask } from "../server/answers";
+import { ask, Latest, words } from "../server/answers";
 import { NotesPanel } from "../widgets/notes_panel";
-import type { Services, View } from "./view";
+import { type Services, type View, viewNode } from "./view";
 
 // What is shown first, unless nothing was stored in it.
 const RECENT_S = 300;
@@ -21,6 +21,8 @@ const ROWS = 1500;
 const RUNS = 20;
 // Panning loads once it has stopped for this long.
 const SETTLED_MS = 200;
+const UNSERVED =
+  "This page was put on the web as it is, and cannot read the tables. To look into the past, run `iort dashboard` on a machine with access to the cloud, or `iort query`.";
 
 export class HistoryView implements View<RouteTo<"history">> {
   readonly node: HTMLElement;
@@ -38,7 +40,7 @@ export class HistoryView implements View<RouteTo<"history">> {
   private range: Range | undefined;
   /** The ranges from which the viewer zoomed in. */
   private zooms: Range[] = [];
-  private loading: AbortController | undefined;
+  private readonly loading = new Latest();
   private settling: number | undefined;
 
   constructor({ config, table, fleet }: Services) {
@@ -72,26 +74,15 @@ export class HistoryView implements View<RouteTo<"history">> {
       this.result.node,
       this.notes.node,
     ];
-    const told = el(
-      "p",
-      { class: "unserved" },
-      "This page was put on the web as it is, and cannot read the tables. To look into the past, run ",
-      el("code", {}, "iort dashboard"),
-      " on a machine with access to the cloud, or ",
-      el("code", {}, "iort query"),
-      ".",
-    );
-    this.node = el(
-      "article",
-      { class: "history" },
-      el(
-        "header",
-        { class: "car-head" },
-        this.name.node,
-        el("p", { class: "car-state" }, "history"),
-        el("p", { class: "tools" }, this.live, this.insights),
-      ),
-      ...(config.answers ? served : [told]),
+    const beside = [
+      el("p", { class: "car-state" }, "history"),
+      el("p", { class: "tools" }, this.live, this.insights),
+    ];
+    this.node = viewNode(
+      "history",
+      this.name.node,
+      beside,
+      ...(config.answers ? served : [unserved(UNSERVED)]),
     );
   }
 
@@ -105,7 +96,7 @@ export class HistoryView implements View<RouteTo<"history">> {
 
   leave(): void {
     this.result.stop();
-    this.loading?.abort();
+    this.loading.stop();
   }
 
   show({ robot, query = {} }: RouteTo<"history">): void {
@@ -114,7 +105,7 @@ export class HistoryView implements View<RouteTo<"history">> {
       this.follow(query);
       return;
     }
-    this.loading?.abort();
+    this.loading.stop();
     this.robot = robot;
     this.name.set(robot);
     this.live.href = route({ view: "car", robot });
@@ -133,31 +124,32 @@ export class HistoryView implements View<RouteTo<"history">> {
 
   /** Find the robot's streams and runs, and show what the address says, or the newest. */
   private async enter(robot: string, query: Query<"history">): Promise<void> {
-    const loading = (this.loading = new AbortController());
     const runs = this.findRuns();
     this.note.set("Looking for what is stored …");
-    try {
-      const { streams } = await ask<{ streams: string[] }>("streams", { robot }, loading.signal);
-      const stream = [query.stream, this.table.stream, streams[0]].find(
-        (name) => name !== undefined && streams.includes(name),
-      );
-      this.form.node.hidden = stream === undefined;
-      if (stream === undefined) {
-        this.note.set("Nothing of this car is stored.");
-        return;
-      }
-      this.form.node.inert = false;
-      this.form.streams(streams);
-      this.form.stream = stream;
-      this.runs.show(stream);
-      this.result.wanted = query.fields?.split(",") ?? [];
-      this.result.at = readTime(query.at);
-      const range = readRange(query.from, query.to);
-      if (!range) await runs;
-      if (!loading.signal.aborted) this.go(range ?? this.newest());
-    } catch (error) {
-      if (!loading.signal.aborted) this.note.set(words(error));
-    }
+    await this.loading.run(
+      async (signal) => {
+        const { streams } = await ask<StreamsAnswer>("streams", { robot }, signal);
+        const stream = [query.stream, this.table.stream, streams[0]].find(
+          (name) => name !== undefined && streams.includes(name),
+        );
+        this.form.node.hidden = stream === undefined;
+        if (stream === undefined) {
+          this.note.set("Nothing of this car is stored.");
+          return;
+        }
+        this.form.node.inert = false;
+        this.form.streams(streams);
+        this.form.stream = stream;
+        this.runs.show(stream);
+        this.result.wanted = query.fields?.split(",") ?? [];
+        this.result.at = readTime(query.at);
+        const range = readRange(query.from, query.to);
+        if (!range) await runs;
+        signal.throwIfAborted();
+        this.go(range ?? this.newest());
+      },
+      (reason) => this.note.set(reason),
+    );
   }
 
   /** List the runs, or older ones. Without them the view still shows ranges. */
@@ -267,37 +259,24 @@ export class HistoryView implements View<RouteTo<"history">> {
   }
 
   private asked(): Readonly<Record<string, string>> {
-    const [from, to] = this.range!.map((at) => String(Math.round(at * 1e6))) as [string, string];
-    return { robot: this.robot, stream: this.form.stream, from_us: from, to_us: to };
+    return { robot: this.robot, stream: this.form.stream, ...inUs(this.range!) };
   }
 
   private async load(range: Range): Promise<void> {
-    this.loading?.abort();
-    const loading = (this.loading = new AbortController());
     void this.notes.show(this.robot, range);
     this.note.set("Loading …");
     const began = performance.now();
-    try {
-      const drive = await ask<HistoryAnswer>(
-        "history",
-        { ...this.asked(), rows: String(ROWS) },
-        loading.signal,
-      );
-      if (loading.signal.aborted) return;
-      if (drive.samples === 0) this.result.clear();
-      else this.result.set(this.robot, this.form.stream, drive, range);
-      const each =
-        drive.row_s > 0
-          ? `, averaged per ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)}, band = min to max`
-          : "";
-      this.note.set(
-        drive.samples === 0
-          ? this.nothing()
-          : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.${fromArchive(drive.archive, range)}${unread(drive)}`,
-      );
-    } catch (error) {
-      if (!loading.signal.aborted) this.note.set(words(error));
-    }
+    await this.loading.run(
+      async (signal) => {
+        const asked = { ...this.asked(), rows: String(ROWS) };
+        const drive = await ask<HistoryAnswer>("history", asked, signal);
+        if (drive.samples === 0) this.result.clear();
+        else this.result.set(this.robot, this.form.stream, drive, range);
+        const after_s = (performance.now() - began) / 1000;
+        this.note.set(drive.samples === 0 ? this.nothing() : about(drive, range, after_s));
+      },
+      (reason) => this.note.set(reason),
+    );
   }
 
   private nothing(): string {
@@ -312,6 +291,11 @@ function recent(seconds: number): Range {
   return [to - seconds, to];
 }
 
-function words(error: unknown): string {
-  return error instanceof AnswerError ? error.message : `The answer could not be read: ${String(error)}`;
+/** What an answer is made of. */
+function about(drive: HistoryAnswer, range: Range, after_s: number): string {
+  const { samples, row_s } = drive;
+  const row = row_s < 1 ? `${number(row_s * 1000, 0)} ms` : age(row_s);
+  const averaged = row_s > 0 ? `, averaged per ${row}, band = min to max` : "";
+  const origin = fromArchive(drive.archive, range) + unread(drive);
+  return `${number(samples)} samples in ${age(after_s)}${averaged}.${origin}`;
 }

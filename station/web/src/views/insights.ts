@@ -1,7 +1,7 @@
 // What the analysis says of a car's drives, or of the fleet's.
 
 import type { Config, Extent, InsightsAnswer, RunsAnswer } from "../base/contract";
-import { el, Text } from "../base/dom";
+import { el, Text, unserved } from "../base/dom";
 import { when } from "../base/format";
 import { type Range, readTime, writeTime } from "../base/range";
 import { type Query, type RouteTo, route, setAddress } from "../base/route";
@@ -11,9 +11,12 @@ import { findingsList } from "../insights/findings_list";
 import { LapsPanel } from "../insights/laps_panel";
 import { Parameters } from "../insights/parameters";
 import { may } from "../server/admission";
-import { AnswerError, ask } from "../server/answers";
+import { ask, words } from "../server/answers";
 import { NotesPanel } from "../widgets/notes_panel";
-import type { Services, View } from "./view";
+import { type Services, type View, viewNode } from "./view";
+
+const UNSERVED =
+  "This page was put on the web as it is, and cannot read the findings. Run `iort dashboard`, or `iort findings`.";
 
 export class InsightsView implements View<RouteTo<"insights">> {
   readonly node: HTMLElement;
@@ -38,15 +41,6 @@ export class InsightsView implements View<RouteTo<"insights">> {
   constructor({ config }: Services) {
     this.config = config;
     this.notes = new NotesPanel(config);
-    const told = el(
-      "p",
-      { class: "unserved" },
-      "This page was put on the web as it is, and cannot read the findings. Run ",
-      el("code", {}, "iort dashboard"),
-      ", or ",
-      el("code", {}, "iort findings"),
-      ".",
-    );
     const status = el(
       "div",
       { class: "history-status" },
@@ -54,21 +48,14 @@ export class InsightsView implements View<RouteTo<"insights">> {
       ...(may(config, "analyse") ? [this.analyse.node] : []),
     );
     const served = [status, this.found, this.notes.node, this.laps.node, this.parameters.node, this.driven];
-    this.node = el(
-      "article",
-      { class: "insights-view" },
-      el(
-        "header",
-        { class: "car-head" },
-        this.name.node,
-        el("p", { class: "car-state" }, "insights"),
-        this.tools,
-      ),
-      ...(config.answers ? served : [told]),
+    this.node = viewNode(
+      "insights-view",
+      this.name.node,
+      [el("p", { class: "car-state" }, "insights"), this.tools],
+      ...(config.answers ? served : [unserved(UNSERVED)]),
     );
   }
 
-  /** Show a robot's insights, or the fleet's if undefined. */
   title({ robot }: RouteTo<"insights">): string {
     return `${robot ?? "Insights"} · iort`;
   }
@@ -110,15 +97,12 @@ export class InsightsView implements View<RouteTo<"insights">> {
     this.laps.node.hidden = true;
     this.note.set("Loading …");
     try {
-      this.answer = await ask<InsightsAnswer>(
-        "insights",
-        robot === undefined ? {} : { robot },
-        loading.signal,
-      );
+      const asked = robot === undefined ? {} : { robot };
+      this.answer = await ask<InsightsAnswer>("insights", asked, loading.signal);
       if (!loading.signal.aborted) await this.present(query);
     } catch (error) {
       if (loading.signal.aborted) return;
-      this.note.set(error instanceof AnswerError ? error.message : String(error));
+      this.note.set(words(error));
       // Laps need no findings.
       if (robot !== undefined && !this.answer)
         await this.showLaps(robot, undefined, query).catch(() => undefined);
@@ -143,9 +127,7 @@ export class InsightsView implements View<RouteTo<"insights">> {
       : `No drive of ${of} has been analysed yet: that happens every night, or now by iort analyse${robot === undefined ? " --fleet" : ` ${robot}`}.`;
     this.note.set(state);
     const list = findingsList(findings, robot === undefined);
-    const nothing = el(
-      "p",
-      { class: "unserved" },
+    const nothing = unserved(
       newest
         ? `Nothing about ${of} differs from its earlier drives by more than chance.`
         : "There are no findings without analysed drives.",
@@ -155,11 +137,8 @@ export class InsightsView implements View<RouteTo<"insights">> {
     const chosen =
       drives.find(({ from_us }) => Math.abs(from_us / 1e6 - wanted) < 0.01) ??
       drives.find(({ failed }) => failed === "");
-    if (robot === undefined) {
-      this.driven.replaceChildren(...(drives.length > 0 ? [drivesTable(drives, robot, undefined)] : []));
-      return;
-    }
-    this.driven.replaceChildren(...(drives.length > 0 ? [drivesTable(drives, robot, chosen?.from_us)] : []));
+    this.driven.replaceChildren(...(newest ? [drivesTable(drives, robot, chosen?.from_us)] : []));
+    if (robot === undefined) return;
     this.parameters.show(answer);
     await this.showLaps(robot, chosen, query);
   }
@@ -172,13 +151,11 @@ export class InsightsView implements View<RouteTo<"insights">> {
     this.laps.node.hidden = extent === undefined;
     if (!extent) return;
     this.drive = [extent.from_us / 1e6, extent.to_us / 1e6];
+    const wanted = (query.laps ?? "").split(",").map(Number);
     await this.laps.show(
       robot,
       this.drive,
-      (query.laps ?? "")
-        .split(",")
-        .map(Number)
-        .filter((lap) => lap > 0),
+      wanted.filter((lap) => lap > 0),
     );
   }
 

@@ -1,6 +1,7 @@
 // What the page has for every view, and what a view is to the page. main.ts lists the views.
 
 import type { Config, FieldTable } from "../base/contract";
+import { el } from "../base/dom";
 import type { Route } from "../base/route";
 import type { DrivePanel } from "../drive/panel";
 import type { StopControl } from "../drive/stop_control";
@@ -45,3 +46,14 @@ export interface View<R extends Route = Route> {
   clock?(now: number, linked: boolean): void;
   key?(event: KeyboardEvent): void;
 }
+
+/** A view's node, with its name and what stands beside that. */
+export const viewNode = (
+  name: string,
+  title: Node | string,
+  beside: readonly (Node | string)[],
+  ...children: (Node | string)[]
+): HTMLElement => {
+  const heading = typeof title === "string" ? el("h2", { class: "car-name" }, title) : title;
+  return el("article", { class: name }, el("header", { class: "car-head" }, heading, ...beside), ...children);
+};

@@ -5,15 +5,10 @@ import { el, setAttribute, Text } from "../base/dom";
 import { age, linear, milliseconds, NOTHING, number } from "../base/format";
 import { route } from "../base/route";
 import { Sparkline } from "../charts/sparkline";
+import type { Word } from "../drive/stops";
 import type { Fleet } from "../live/fleet";
 import { hottest, type Robot } from "../live/robot";
 import { CARD_FIELD, numeric } from "../live/stream";
-
-/** What an emergency stop means for the car, and why it does not stand or cannot be stopped. */
-export interface StopWord {
-  readonly kind: "stands" | "moves" | "unable" | "";
-  readonly why: string;
-}
 
 export class Card {
   readonly node: HTMLElement;
@@ -37,7 +32,7 @@ export class Card {
 
   update(
     robot: Robot,
-    { fleet, table, stop }: { readonly fleet: Fleet; readonly table: FieldTable; readonly stop: StopWord },
+    { fleet, table, stop }: { readonly fleet: Fleet; readonly table: FieldTable; readonly stop: Word },
     now: number,
     linked: boolean,
   ): void {

@@ -1,7 +1,7 @@
 // A table of values: at the time under the cursor, and now.
 
 import { power_w, type Value } from "../base/contract";
-import { el, Text } from "../base/dom";
+import { el, Text, table } from "../base/dom";
 import { NOTHING, number, type Spec, write } from "../base/format";
 import { numeric, type Stream } from "../live/stream";
 
@@ -14,23 +14,14 @@ interface Row {
 }
 
 export class Comparison {
-  readonly node: HTMLElement;
   private readonly body = el("tbody");
+  readonly node = el(
+    "section",
+    { class: "panel compare", "aria-label": "Then and now" },
+    table(["Field", "Then", "Now", "Change", "Unit"], this.body),
+  );
   private readonly rows = new Map<string, Row>();
   private live: Stream | undefined;
-
-  constructor() {
-    const head = el(
-      "tr",
-      {},
-      ...["Field", "Then", "Now", "Change", "Unit"].map((name) => el("th", { scope: "col" }, name)),
-    );
-    this.node = el(
-      "section",
-      { class: "panel compare", "aria-label": "Then and now" },
-      el("table", {}, el("thead", {}, head), this.body),
-    );
-  }
 
   of(fields: readonly (readonly [string, Spec])[]): void {
     this.rows.clear();

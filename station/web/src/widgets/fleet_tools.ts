@@ -1,7 +1,7 @@
 // Which cars the fleet's view shows and in which order: search, sort and group, kept in the address and in this browser.
 
 import type { FieldTable } from "../base/contract";
-import { byName, el } from "../base/dom";
+import { byName, choices, el, form } from "../base/dom";
 import { keep, kept } from "../base/kept";
 import { type Query, setAddress } from "../base/route";
 import type { Registry } from "../live/registry";
@@ -42,7 +42,7 @@ export class FleetTools {
   private readonly sort = el(
     "select",
     { name: "sort" },
-    ...Object.entries(SORTS).map(([value, { label }]) => el("option", { value }, label)),
+    ...choices(Object.entries(SORTS).map(([value, { label }]) => [value, label] as const)),
   );
   private readonly group = el("select", { name: "group" });
   private readonly grouping = el("label", { hidden: "" }, "Group by ", this.group);
@@ -54,14 +54,9 @@ export class FleetTools {
     private readonly table: FieldTable,
     private readonly changed: () => void,
   ) {
-    this.node = el(
-      "form",
-      { class: "range fleet-tools", role: "search" },
-      this.find,
-      el("label", {}, "Sort by ", this.sort),
-      this.grouping,
-    );
-    this.node.addEventListener("submit", (event) => event.preventDefault());
+    const sorting = el("label", {}, "Sort by ", this.sort);
+    const attributes = { class: "range fleet-tools", role: "search" };
+    this.node = form(attributes, () => undefined, this.find, sorting, this.grouping);
     for (const each of [this.find, this.sort, this.group])
       each.addEventListener("input", () => this.choose());
   }
@@ -91,10 +86,7 @@ export class FleetTools {
     );
     if (String(names) !== this.known) {
       this.known = String(names);
-      this.group.replaceChildren(
-        el("option", { value: "" }, "Nothing"),
-        ...names.map((name) => el("option", { value: name }, name)),
-      );
+      this.group.replaceChildren(el("option", { value: "" }, "Nothing"), ...choices(names));
     }
     this.grouping.hidden = names.length === 0;
     this.group.value = names.includes(this.wanted) ? this.wanted : "";

@@ -1,9 +1,9 @@
 // A log widget: the rows of its query. It has a request of its own, because Logs Insights takes seconds.
 
 import type { Logs } from "../base/contract";
-import { el, Text } from "../base/dom";
+import { el, Text, table } from "../base/dom";
 import { when } from "../base/format";
-import { AnswerError, ask } from "../server/answers";
+import { ask, words } from "../server/answers";
 
 // AWS bills a query by the bytes that it reads.
 const AGAIN_S = 60;
@@ -35,7 +35,7 @@ export class LogTable {
       this.draw(await ask<Logs>("log", this.parameters, asking.signal));
     } catch (error) {
       this.askedAt = -Infinity;
-      if (!asking.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+      if (!asking.signal.aborted) this.note.set(words(error));
     } finally {
       this.asking = undefined;
     }
@@ -55,30 +55,10 @@ export class LogTable {
           ? `Nothing in this range, ${until}.`
           : until,
     );
-    this.host.replaceChildren(
-      ...(rows.length === 0
-        ? []
-        : [
-            el(
-              "table",
-              {},
-              el(
-                "thead",
-                {},
-                el(
-                  "tr",
-                  {},
-                  ...columns.map((column) => el("th", { scope: "col" }, column.replace(/^@/, ""))),
-                ),
-              ),
-              el(
-                "tbody",
-                {},
-                ...rows.map((row) => el("tr", {}, ...row.map((value, i) => cell(columns[i]!, value)))),
-              ),
-            ),
-          ]),
-    );
+    const cells = (row: readonly string[]): HTMLElement[] => row.map((value, i) => cell(columns[i]!, value));
+    const body = el("tbody", {}, ...rows.map((row) => el("tr", {}, ...cells(row))));
+    const head = columns.map((column) => column.replace(/^@/, ""));
+    this.host.replaceChildren(...(rows.length > 0 ? [table(head, body)] : []));
   }
 }
 
@@ -92,9 +72,6 @@ function cell(column: string, value: string): HTMLElement {
   if (column === "@log") return el("td", { title: value }, value.replace(/^\d+:/, ""));
   const [head = "", ...details] = value.split("\n");
   if (details.length === 0) return el("td", { class: "words" }, head);
-  return el(
-    "td",
-    { class: "words" },
-    el("details", {}, el("summary", {}, head), el("pre", {}, details.join("\n"))),
-  );
+  const folded = el("details", {}, el("summary", {}, head), el("pre", {}, details.join("\n")));
+  return el("td", { class: "words" }, folded);
 }

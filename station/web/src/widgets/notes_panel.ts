@@ -1,12 +1,12 @@
 // People's notes about a car, or the fleet: a list, and a form that writes one where the server allows it.
 
 import { type Config, MAX_NOTE_CHARACTERS, type NoteEntry, type NotesAnswer } from "../base/contract";
-import { el } from "../base/dom";
+import { button, el, form, panel } from "../base/dom";
 import { when } from "../base/format";
-import { type Range, writeTime } from "../base/range";
+import { inUs, type Range, writeTime } from "../base/range";
 import { route } from "../base/route";
 import { may } from "../server/admission";
-import { AnswerError, act, ask } from "../server/answers";
+import { act, ask, Latest, words } from "../server/answers";
 
 /** The history around a note, in seconds before and after it. */
 const AROUND_S = 30;
@@ -33,31 +33,16 @@ export class NotesPanel {
   private readonly form: HTMLElement;
   private robot: string | undefined;
   private range: Range | undefined;
-  private loading: AbortController | undefined;
+  private readonly loading = new Latest();
 
   constructor(
     private readonly config: Config,
     private readonly options: NotesOptions = {},
   ) {
     this.text.placeholder = options.at ? "What happened at this time?" : "What happened?";
-    this.form = el(
-      "form",
-      { class: "range note-form" },
-      this.text,
-      el("button", { type: "submit", class: "tool" }, "Add note"),
-    );
-    this.form.addEventListener("submit", (event) => {
-      event.preventDefault();
-      void this.write();
-    });
-    this.node = el(
-      "section",
-      { class: "panel notes", "aria-label": "Notes" },
-      el("header", {}, el("h3", {}, "Notes")),
-      this.list,
-      this.form,
-      this.said,
-    );
+    const add = el("button", { type: "submit", class: "tool" }, "Add note");
+    this.form = form({ class: "range note-form" }, () => void this.write(), this.text, add);
+    this.node = panel("Notes", "notes", [], this.list, this.form, this.said);
   }
 
   /** Show the notes about a car, of a range if there is one; undefined for the fleet's. */
@@ -69,21 +54,15 @@ export class NotesPanel {
   }
 
   private async load(): Promise<void> {
-    this.loading?.abort();
-    const loading = (this.loading = new AbortController());
-    const [from, to] = this.range?.map((at) => String(Math.round(at * 1e6))) ?? [];
-    const asked = {
-      ...(this.robot === undefined ? {} : { robot: this.robot }),
-      ...(from === undefined ? {} : { from_us: from, to_us: to! }),
-    };
-    try {
-      const { notes } = await ask<NotesAnswer>("notes", asked, loading.signal);
-      if (loading.signal.aborted) return;
-      this.fill(notes);
-      this.say("", "");
-    } catch (error) {
-      if (!loading.signal.aborted) this.fail(error);
-    }
+    const { robot, range } = this;
+    const asked = { ...(robot === undefined ? {} : { robot }), ...(range ? inUs(range) : {}) };
+    await this.loading.run(
+      async (signal) => {
+        this.fill((await ask<NotesAnswer>("notes", asked, signal)).notes);
+        this.say("", "");
+      },
+      (reason) => this.say("bad", reason),
+    );
   }
 
   private async write(): Promise<void> {
@@ -95,7 +74,7 @@ export class NotesPanel {
       this.text.value = "";
       if (robot === this.robot) await this.load();
     } catch (error) {
-      this.fail(error);
+      this.say("bad", words(error));
     }
   }
 
@@ -104,7 +83,7 @@ export class NotesPanel {
       await act<NotesAnswer>("delete_note", { robot, id });
       await this.load();
     } catch (error) {
-      this.fail(error);
+      this.say("bad", words(error));
     }
   }
 
@@ -129,26 +108,21 @@ export class NotesPanel {
       el("span", { class: "note" }, moment, ...(this.robot === undefined ? [`, ${robot}`] : []), `, ${by}`),
     );
     if (!may(this.config, "delete_note")) return item;
-    const remove = el(
-      "button",
-      { type: "button", class: "tool", "aria-label": `Delete the note: ${text.slice(0, 60)}` },
+    const remove = button(
       "Delete",
+      () => {
+        if (remove.dataset.sure === "true") void this.remove(note);
+        remove.dataset.sure = "true";
+        remove.textContent = "Really delete";
+      },
+      { "aria-label": `Delete the note: ${text.slice(0, 60)}` },
     );
-    remove.addEventListener("click", () => {
-      if (remove.dataset.sure === "true") void this.remove(note);
-      remove.dataset.sure = "true";
-      remove.textContent = "Really delete";
-    });
     remove.addEventListener("blur", () => {
       remove.dataset.sure = "false";
       remove.textContent = "Delete";
     });
     item.append(remove);
     return item;
-  }
-
-  private fail(error: unknown): void {
-    this.say("bad", error instanceof AnswerError ? error.message : String(error));
   }
 
   private say(kind: string, text: string): void {

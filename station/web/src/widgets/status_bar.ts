@@ -2,7 +2,7 @@
 
 import { now } from "../base/clock";
 import { type Config, type FieldTable, LIVE } from "../base/contract";
-import { byId, setAttribute } from "../base/dom";
+import { byId, setAttribute, setText } from "../base/dom";
 import { age, number } from "../base/format";
 import type { Viewing } from "../link/viewing";
 import type { LinkState } from "../link/worker_messages";
@@ -116,7 +116,4 @@ export class StatusBar {
   }
 }
 
-function write(id: string, text: string): void {
-  const node = byId(id);
-  if (node.textContent !== text) node.textContent = text;
-}
+const write = (id: string, text: string): void => setText(byId(id), text);

@@ -1,7 +1,7 @@
 // What is shown instead of cars or of a car: nothing was heard yet. It tells an unknown car from one that is off.
 
 import type { Config } from "../base/contract";
-import { byId, byName } from "../base/dom";
+import { byId, byName, setText } from "../base/dom";
 import { capital } from "../base/format";
 import { route } from "../base/route";
 import type { Fleet } from "../live/fleet";
@@ -29,16 +29,15 @@ export class Waiting {
       unknown ? `There is no car ${robot}` : off ? `${robot} is offline` : `Waiting for ${robot ?? "a car"}`,
     );
     const refused = robot === undefined ? undefined : this.fleet.refused.get(robot);
-    if (refused)
-      write(
-        "empty-text",
-        `${refused.messages} live messages came and could not be read; the last: ${refused.reason}.`,
-      );
-    else
-      write(
-        "empty-text",
-        unknown ? registered(Object.keys(robots)) : known ? `${capital(presence(known))}. ${comes}` : comes,
-      );
+    const state = known ? `${capital(presence(known))}. ${comes}` : comes;
+    write(
+      "empty-text",
+      refused
+        ? `${refused.messages} live messages came and could not be read; the last: ${refused.reason}.`
+        : unknown
+          ? registered(Object.keys(robots))
+          : state,
+    );
     byId("empty-listening").hidden = unknown || off !== undefined;
     const past = byId("empty-past");
     past.hidden = robot === undefined || unknown || !this.config.answers;
@@ -52,7 +51,4 @@ function registered(names: readonly string[]): string {
   return `Registered: ${shown.join(", ")}${names.length > shown.length ? ` and ${names.length - shown.length} more` : ""}.`;
 }
 
-function write(id: string, text: string): void {
-  const node = byId(id);
-  if (node.textContent !== text) node.textContent = text;
-}
+const write = (id: string, text: string): void => setText(byId(id), text);
