@@ -62,6 +62,9 @@ class Page {
   private shape = -1;
   private clockAt = -Infinity;
   private valuesAt = -Infinity;
+  /** The messages that were heard when one was drawn at once, and that time. */
+  private heard = 0;
+  private heardAt = -Infinity;
 
   constructor(config: Config, table: FieldTable) {
     this.fleet = new Fleet(config, table);
@@ -185,7 +188,10 @@ class Page {
     requestAnimationFrame(this.frame);
     const at = now();
     if (this.fleet.shape !== this.shape) this.arrange();
-    if (at - this.valuesAt >= VALUES_S) {
+    // A message after a pause is drawn with this frame, and does not wait for the next turn.
+    const heard = this.fleet.received !== this.heard && at - this.heardAt >= VALUES_S;
+    if (heard) [this.heard, this.heardAt] = [this.fleet.received, at];
+    if (heard || at - this.valuesAt >= VALUES_S) {
       this.valuesAt = at;
       this.view.values?.(at);
       this.bar.speed(this.view.speed?.(at));
