@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
-
 import pytest
 
 from testkit import chromium
 from testkit.waiting import GUARD_S, until
 
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
-
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     # Imported here: every test loads this file, and on the robot's Python 3.8 the station does not run.
     from iort_station.page.page import BUILT
 
@@ -32,7 +26,7 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
+def open_page(browser):
     """Open an address in a new window and wait until the page is connected.
 
     A script's error fails the test, and so does what the page's policy forbids, unless the test takes it
@@ -40,7 +34,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     """
     contexts, errors = [], []
 
-    def open_(url: str, *, listening: bool = True, **options: Any) -> Page:
+    def open_(url, *, listening=True, **options):
         context = browser.new_context(**{"viewport": {"width": 1280, "height": 900}, **options})
         contexts.append(context)
         context.set_default_timeout(GUARD_S * 1000)
@@ -52,24 +46,24 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
             until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect")
         return page
 
-    open_.errors = errors  # type: ignore[attr-defined]  # for tests that provoke some
+    open_.errors = errors
     yield open_
     for context in contexts:
         context.close()
     assert not errors, errors
 
 
-def plain(text: str) -> str:
+def plain(text):
     """Convert a text with minus signs and thin spaces to plain characters."""
     return text.replace("\u2212", "-").replace("\u202f", "")
 
 
-def shown(page: Page, name: str) -> str:
+def shown(page, name):
     """Return the text of a value on the page."""
     return plain(page.locator(f"[data-value='{name}']").inner_text())
 
 
-def show(page: Page, update: Mapping[str, Any]) -> None:
+def show(page, update):
     """Wait until the page has drawn the update."""
     robot, stream, seq = update["robot"], update["stream"], update["seq"]
     script = "([robot, stream]) => iort.robots[robot]?.streams[stream]?.seq"
@@ -77,7 +71,7 @@ def show(page: Page, update: Mapping[str, Any]) -> None:
     drawn(page)
 
 
-def drawn(page: Page) -> None:
+def drawn(page):
     """Wait until the page has drawn its values again: it does so at most 25 times a second."""
     frames = "requestAnimationFrame(() => requestAnimationFrame(done))"
     page.evaluate(f"() => new Promise((done) => setTimeout(() => {frames}, 50))")

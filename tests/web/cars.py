@@ -5,22 +5,15 @@ from __future__ import annotations
 import http.client
 import json
 import time
-from typing import TYPE_CHECKING, Any
 
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import channel as pubnub_channel
-from iort_contract.limits import Value
 from iort_contract.messages.live import LiveSample, live_update
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from local.pubnub import PubNubStandIn
 
 PUBLISH_KEY, SUBSCRIBE_KEY = "pub-local", "sub-local"
 GAIN = F1TENTH.speed_to_erpm_gain
-SAMPLE: dict[str, Value] = {
+SAMPLE = {
     "voltage_input": 11.65,
     "temperature_pcb": 29.9,
     "current_motor": 3.96,
@@ -37,10 +30,10 @@ SAMPLE: dict[str, Value] = {
 class Car:
     """Publishes live updates over plain HTTP, as Lambda 1 does."""
 
-    def __init__(self, pubnub: PubNubStandIn, name: str = "car-1", boot: str = "0a1b2c3d") -> None:
+    def __init__(self, pubnub, name="car-1", boot="0a1b2c3d"):
         self.pubnub, self.name, self.boot, self.seq = pubnub, name, boot, 0
 
-    def update(self, sample: Mapping[str, Value] = SAMPLE, **change: Any) -> dict[str, Any]:
+    def update(self, sample=SAMPLE, **change):
         now_us = time.time_ns() // 1000
         live = LiveSample(self.boot, self.seq, now_us - 12_000, now_us - 10_000, dict(sample))
         self.seq += 1
@@ -50,12 +43,12 @@ class Car:
             **change,
         }
 
-    def send(self, sample: Mapping[str, Value] = SAMPLE, **change: Any) -> dict[str, Any]:
+    def send(self, sample=SAMPLE, **change):
         update = self.update(sample, **change)
         self.publish(update)
         return update
 
-    def publish(self, message: Any, channel: str | None = None) -> None:
+    def publish(self, message, channel=None):
         host, port = self.pubnub.origin.split(":")
         connection = http.client.HTTPConnection(host, int(port), timeout=60)
         path = f"/publish/{PUBLISH_KEY}/{SUBSCRIBE_KEY}/0/{channel or pubnub_channel(self.name)}/0"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -13,14 +12,9 @@ from testkit.ports import free_port
 from tests.web.cars import GAIN, PUBLISH_KEY, SUBSCRIBE_KEY, Car
 from tests.web.lab import Lab
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from playwright.sync_api import Page
-
 
 @pytest.fixture(scope="module")
-def pubnub() -> Iterator[PubNubStandIn]:
+def pubnub():
     # A test may start it again.
     port = free_port()
     with PubNubStandIn(publish_key=PUBLISH_KEY, subscribe_key=SUBSCRIBE_KEY, port=port) as pubnub:
@@ -28,16 +22,16 @@ def pubnub() -> Iterator[PubNubStandIn]:
 
 
 @pytest.fixture
-def car(pubnub: PubNubStandIn) -> Car:
+def car(pubnub):
     return Car(pubnub)
 
 
 @pytest.fixture
-def serve(pubnub: PubNubStandIn) -> Iterator[Callable[..., PageServer]]:
+def serve(pubnub):
     """Serve a page that hears the cars, until the test ends."""
     with ExitStack() as stack:
 
-        def served(**settings: Any) -> PageServer:
+        def served(**settings):
             listening = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
             return stack.enter_context(PageServer(namespace="iort", **{**listening, **settings}))
 
@@ -45,21 +39,21 @@ def serve(pubnub: PubNubStandIn) -> Iterator[Callable[..., PageServer]]:
 
 
 @pytest.fixture
-def url(serve: Callable[..., PageServer]) -> str:
+def url(serve):
     return serve(vehicles={"car-1": {"speed_to_erpm_gain": GAIN}}).url
 
 
 @pytest.fixture
-def page(open_page: Callable[..., Page], url: str) -> Page:
+def page(open_page, url):
     return open_page(f"{url}#/car/car-1")
 
 
 @pytest.fixture
-def lab() -> Lab:
+def lab():
     return Lab()
 
 
 @pytest.fixture
-def server(serve: Callable[..., PageServer], lab: Lab) -> PageServer:
+def server(serve, lab):
     """The lab's page."""
     return serve(**lab.served())

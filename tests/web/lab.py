@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from iort_contract.catalog.analysis import GROUPS, KINDS, PARAMETERS
 from iort_contract.catalog.metrics import METRICS, alarm_of
@@ -13,31 +13,17 @@ from iort_contract.messages.commands import NO_MOTION
 from iort_station.errors import StationError
 from tests.web.cars import GAIN, SAMPLE
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from iort_contract.messages.insights import (
-        DeltaAnswer,
-        DriveEntry,
-        EstimateEntry,
-        Extent,
-        FindingEntry,
-        InsightsAnswer,
-        LapsAnswer,
-    )
-    from iort_contract.messages.page import AlarmEntry, HistoryAnswer, Run, RunPart, RunsAnswer
-
 _DAY_US = 86_400_000_000
 _NEWEST_US = round(time.time() - 3600) * 1_000_000
 _LAP_S = 12.0
 _PLACES = 200
 
 
-def _estimate(value: float, either: float, unit: str) -> EstimateEntry:
+def _estimate(value, either, unit):
     return {"value": value, "low": value - either, "high": value + either, "unit": unit}
 
 
-def drive(days_ago: int, *, failed: str = "", robot: str = "car-1") -> DriveEntry:
+def drive(days_ago, *, failed="", robot="car-1"):
     start_us = _NEWEST_US - days_ago * _DAY_US
     grown = 0.04 + 0.003 * max(0, 5 - days_ago)
     return {
@@ -58,7 +44,7 @@ def drive(days_ago: int, *, failed: str = "", robot: str = "car-1") -> DriveEntr
     }
 
 
-def finding(kind: str, **given: object) -> FindingEntry:
+def finding(kind, **given):
     entry = KINDS[kind]
     return {
         "id": kind,
@@ -78,10 +64,10 @@ def finding(kind: str, **given: object) -> FindingEntry:
         "baseline": _estimate(0.04, 0.003, "ohm"),
         "q": 0.002,
         **given,
-    }  # type: ignore[typeddict-item]  # of any kind
+    }
 
 
-def insights(asked: Mapping[str, str]) -> InsightsAnswer:
+def insights(asked):
     robot = asked.get("robot", "car-1")
     groups = {
         group: {p.name: {"unit": p.unit, "meaning": p.meaning, "worse": p.worse} for p in parameters}
@@ -97,7 +83,7 @@ def insights(asked: Mapping[str, str]) -> InsightsAnswer:
     return {"findings": findings, "drives": [*drives, failed], "groups": groups}
 
 
-def laps(asked: Mapping[str, str]) -> LapsAnswer:
+def laps(asked):
     start_us = int(asked["from_us"])
     times = [_LAP_S + 0.3 * math.sin(i) for i in range(9)]
     return {
@@ -124,7 +110,7 @@ def laps(asked: Mapping[str, str]) -> LapsAnswer:
     }
 
 
-def delta(asked: Mapping[str, str]) -> DeltaAnswer:
+def delta(asked):
     shares = [i / _PLACES for i in range(_PLACES + 1)]
     return {
         "places": [47.5 * share for share in shares],
@@ -165,7 +151,7 @@ WHY_NOT = f"a stop does nothing there: {NO_MOTION}"
 _LONG = "a_field_" + "x" * 99
 
 
-def alarm(key: str, state: str = "ALARM", **given: Any) -> AlarmEntry:
+def alarm(key, state="ALARM", **given):
     entry = alarm_of(key)
     assert entry
     return {
@@ -183,11 +169,11 @@ def alarm(key: str, state: str = "ALARM", **given: Any) -> AlarmEntry:
         "named": False,
         "acknowledged": None,
         **given,
-    }  # type: ignore[typeddict-item]  # of any state
+    }
 
 
 _PLAIN = {"low": 0.0, "high": 10.0, "unit": "", "names": [], "desired": False, "pending": None, "reason": ""}
-SETTINGS: list[dict[str, Any]] = [
+SETTINGS = [
     {**_PLAIN, "name": "live.enabled", "kind": "flag", "value": "true"},
     {**_PLAIN, "name": "live.rate_hz", "kind": "number", "unit": "Hz", "value": "10", "pending": "5"},
     {**_PLAIN, "name": "log_level", "kind": "choice", "names": ["info", "debug"], "value": ""},
@@ -208,18 +194,18 @@ LIMITS = {
 class Lab:
     """What the lab's server answers; a test may change it."""
 
-    def __init__(self) -> None:
-        self.asked: list[dict[str, str]] = []
+    def __init__(self):
+        self.asked = []
         self.refuses = False
         # Whether each car is told to stop, and whether it stands.
         self.cars = {"car-1": [False, False], "car-9": [False, False]}
         self.confirms = True
         self.streams = [VESC_STREAM]
         # The cars that were stopped alone.
-        self.alone: set[str] = set()
+        self.alone = set()
         # The cars without a command that moves them, which reject a stop.
-        self.unstoppable: set[str] = set()
-        self.notes: list[dict[str, Any]] = []
+        self.unstoppable = set()
+        self.notes = []
         self.write({"robot": "car-1", "text": "changed the left front tyre"})
         self.alarms = [
             alarm("FaultSamples", robots=["car-1", "car-2"], named=True),
@@ -228,16 +214,16 @@ class Lab:
             *(alarm(name, "OK") for name, metric in METRICS.items() if metric.alarm and name[0] in "TBP"),
         ]
 
-    def answer_alarms(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+    def answer_alarms(self, _asked):
         if self.refuses:
             raise StationError("no such right")
         return {"alarms": self.alarms, "user": "operator@lab"}
 
-    def answer_notes(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def answer_notes(self, asked):
         low, high = (int(asked.get(name, 0)) for name in ("from_us", "to_us"))
         return {"notes": [one for one in self.notes if low <= one["t_us"] < (high or math.inf)]}
 
-    def acknowledge(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def acknowledge(self, asked):
         self.asked.append(dict(asked))
         seen = {"by": asked["by"] or "operator@lab", "at_s": time.time()}
         self.alarms = [
@@ -246,18 +232,18 @@ class Lab:
         ]
         return seen
 
-    def write(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def write(self, asked):
         t_us = int(asked.get("t_us") or time.time_ns() // 1000)
         note = {"robot": asked["robot"], "t_us": t_us, "text": asked["text"], "by": "operator@lab"}
         self.notes.append({"id": f"{t_us:016d}-{len(self.notes):08x}", **note})
         self.notes.sort(key=lambda one: one["id"], reverse=True)
         return {"notes": self.notes}
 
-    def delete(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def delete(self, asked):
         self.notes = [one for one in self.notes if one["id"] != asked["id"]]
         return {"notes": self.notes}
 
-    def motion(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def motion(self, asked):
         cars = {
             name: {
                 "asked": told and name not in self.unstoppable,
@@ -276,10 +262,10 @@ class Lab:
         }
         return {"robots": cars, "user": "operator@lab", "failed": {}}
 
-    def drive(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+    def drive(self, _asked):
         raise StationError("the role of a driver cannot be assumed")
 
-    def stop(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def stop(self, asked):
         self.asked.append(dict(asked))
         told = asked["stopped"] == "true"
         if "robot" in asked:
@@ -289,7 +275,7 @@ class Lab:
                 car[:] = [told, told if self.confirms else car[1]]
         return self.motion(asked)
 
-    def served(self) -> dict[str, Any]:
+    def served(self):
         """What its server answers and does."""
         return {
             "vehicles": {"car-1": {"speed_to_erpm_gain": GAIN}},
@@ -306,7 +292,7 @@ class Lab:
             },
         }
 
-    def answers(self) -> dict[str, Any]:
+    def answers(self):
         presence = {"online": False, "since_ms": round(NOW_S - 3600) * 1000}
         return {
             "robots": lambda _: {"robots": {"car-1": {**presence, "online": True}, "car-9": presence}},
@@ -346,11 +332,11 @@ class Lab:
             },
         }
 
-    def dashboard(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def dashboard(self, asked):
         to_s = int(NOW_S)
         times = [to_s - 600 + 60 * i for i in range(10)]
         line = {"label": "Published", "right": False, "times_s": times, "values": [*range(10)]}
-        drawn: dict[str, Any] = {"width": 24, "height": 5, "text": "", "period_s": 60}
+        drawn = {"width": 24, "height": 5, "text": "", "period_s": 60}
         widgets = [
             {"kind": "text", "title": "", "text": "# The platform\nEverything at a glance."},
             {"kind": "alarms", "title": "Alarms", "alarms": self.alarms},
@@ -373,14 +359,14 @@ class Lab:
         }
 
 
-def runs() -> RunsAnswer:
-    extent: Extent = {"from_us": round(NOW_S - 60) * 1_000_000, "to_us": round(NOW_S) * 1_000_000}
-    part: RunPart = {**extent, "batches": 60, "samples": 3000}
-    run: Run = {**extent, "run": "0a1b2c3d", "state": "running", "lost": 2, "streams": {VESC_STREAM: part}}
+def runs():
+    extent = {"from_us": round(NOW_S - 60) * 1_000_000, "to_us": round(NOW_S) * 1_000_000}
+    part = {**extent, "batches": 60, "samples": 3000}
+    run = {**extent, "run": "0a1b2c3d", "state": "running", "lost": 2, "streams": {VESC_STREAM: part}}
     return {"runs": [run], "older": True, "streams": {VESC_STREAM: extent}}
 
 
-def history(asked: Mapping[str, str]) -> HistoryAnswer:
+def history(asked):
     start_s, end_s = int(asked["from_us"]) / 1e6, int(asked["to_us"]) / 1e6
     times = [start_s + (end_s - start_s) * i / 200 for i in range(200)]
     fields = {
@@ -391,8 +377,8 @@ def history(asked: Mapping[str, str]) -> HistoryAnswer:
     return past(times, fields, row_s=2)
 
 
-def past(times_s: Sequence[float], fields: Mapping[str, Sequence[Any]], row_s: float = 0) -> HistoryAnswer:
+def past(times_s, fields, row_s=0):
     """The answer of columns of means."""
     columns = {name: {"mean": list(values)} for name, values in fields.items()}
-    answer: Any = {"times_s": times_s, "fields": columns, "samples": len(times_s), "row_s": row_s}
+    answer = {"times_s": times_s, "fields": columns, "samples": len(times_s), "row_s": row_s}
     return {**answer, "ros2": False, "archive": None, "refused": 0, "reason": ""}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import threading
-from typing import TYPE_CHECKING, Any
 
 import pytest
 from aiohttp import web
@@ -18,15 +17,6 @@ from testkit.waiting import GUARD_S, until
 from tests.browser import show
 from tests.web.cars import Car
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from pathlib import Path
-
-    from playwright.sync_api import Page
-
-    from iort_station.page.server import PageServer
-    from local.pubnub import PubNubStandIn
-
 # Of one request to subscribe.
 MOST_FILTERS = 8
 CONNECT, SUBSCRIBE = 1, 8
@@ -37,11 +27,11 @@ CREDENTIALS = {"AccessKeyId": "ASIA", "SecretKey": "s", "SessionToken": "t"}
 class Broker(BackgroundServer):
     """Gives anybody an identity, and ends a connection that subscribes to too much at once."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__("127.0.0.1", 0)
-        self.asked: list[int] = []
+        self.asked = []
 
-    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+    async def handle(self, request):
         if request.path != "/mqtt":
             cors = {"Access-Control-Allow-Origin": "*", "Access-Control-Allow-Headers": "*"}
             return web.json_response({"IdentityId": "i", "Credentials": CREDENTIALS}, headers=cors)
@@ -62,7 +52,7 @@ class Broker(BackgroundServer):
         return socket
 
 
-def packets(sent: bytes) -> Iterator[tuple[int, bytes]]:
+def packets(sent):
     """The MQTT packets of a WebSocket's message: kind and body."""
     while sent:
         # The length in groups of seven bits; the last group has no high bit.
@@ -72,9 +62,7 @@ def packets(sent: bytes) -> Iterator[tuple[int, bytes]]:
         sent = sent[ends + 1 + length :]
 
 
-def test_a_page_of_many_cars_subscribes_within_the_limit_of_a_request(
-    open_page: Callable[..., Page], serve: Callable[..., PageServer]
-) -> None:
+def test_a_page_of_many_cars_subscribes_within_the_limit_of_a_request(open_page, serve):
     with Broker() as broker:
         socket = f"ws://127.0.0.1:{broker.port}"
         identity = {
@@ -94,7 +82,7 @@ REFUSED, NO_GATEWAY = 403, 502
 
 
 @pytest.fixture
-def relay(tmp_path: Path) -> Iterator[Relay]:
+def relay(tmp_path):
     Authority().write_own(tmp_path / "ca.pem")
     # Nothing listens on port 9.
     with Relay("127.0.0.1", 0, gateway="https://127.0.0.1:9", authority=str(tmp_path / "ca.pem")) as relay:
@@ -114,7 +102,7 @@ def relay(tmp_path: Path) -> Iterator[Relay]:
         ("null", REFUSED),
     ],
 )
-def test_only_a_page_of_this_machine_gets_through(relay: Relay, origin: str | None, status: int) -> None:
+def test_only_a_page_of_this_machine_gets_through(relay, origin, status):
     socket = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Protocol": "mqtt"}
     call = {"Content-Type": "application/x-amz-json-1.1", "X-Amz-Target": "AWSCognitoIdentityService.GetId"}
     for method, path, headers in (("GET", "/mqtt", socket), ("POST", "/", call)):
@@ -147,21 +135,21 @@ window.setInterval = (call, ms) => ms === {VIEW_RENEW_S * 1000:.0f} ? 0 : every(
 class Leases:
     """Keeps what the page's server was asked for."""
 
-    def __init__(self) -> None:
-        self.asked: list[Mapping[str, str]] = []
+    def __init__(self):
+        self.asked = []
         # The ends of leases wait for it.
         self.ends = threading.Event()
         self.ends.set()
 
-    def view(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def view(self, asked):
         if asked["lease_ms"] == "0":
             assert self.ends.wait(GUARD_S)
         self.asked.append(asked)
         return {"asked": asked["robots"].count(",") + 1}
 
-    def held(self) -> dict[str, float]:
+    def held(self):
         """The highest rate of each robot with a lease."""
-        held: dict[tuple[str, str], float] = {}
+        held = {}
         for asked in list(self.asked):
             for robot in asked["robots"].split(","):
                 held.pop((robot, asked["viewer"]), None)
@@ -171,12 +159,12 @@ class Leases:
 
 
 @pytest.fixture
-def leases() -> Leases:
+def leases():
     return Leases()
 
 
 @pytest.fixture
-def served(serve: Callable[..., PageServer], leases: Leases) -> str:
+def served(serve, leases):
     presence = {"online": True, "since_ms": 0}
     answers = {
         "robots": lambda _: {"robots": {"car-99": presence, "car-98": {**presence, "online": False}}},
@@ -187,8 +175,8 @@ def served(serve: Callable[..., PageServer], leases: Leases) -> str:
 
 
 def test_the_page_holds_what_is_on_the_screen_and_nothing_while_hidden_or_closed(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn, served: str, leases: Leases
-) -> None:
+    open_page, pubnub, served, leases
+):
     page = open_page(served, viewport={"width": 700, "height": 400})
     # It is connected, and has not been heard.
     until(lambda: leases.held() == {"car-99": 1.0}, "a look at the registered car")
@@ -220,7 +208,7 @@ def test_the_page_holds_what_is_on_the_screen_and_nothing_while_hidden_or_closed
     until(lambda: leases.held() == {"car-7": 1.0}, "the closed page's last word")
 
 
-def test_an_idle_car_is_not_stale_and_is_gone_when_it_breaks_its_word(page: Page, car: Car) -> None:
+def test_an_idle_car_is_not_stale_and_is_gone_when_it_breaks_its_word(page, car):
     show(page, car.send(next_ms=60_000))
     until(lambda: page.get_attribute("#car", "data-state") == "idle", "the car to be idle")
     assert "idle: newest values are" in page.inner_text(".car-state")
@@ -238,9 +226,7 @@ def test_an_idle_car_is_not_stale_and_is_gone_when_it_breaks_its_word(page: Page
     until(lambda: page.evaluate("iort.malformed") == 1, "a time that no car may say")
 
 
-def test_a_car_that_is_looked_at_again_is_held_though_the_end_arrives_late(
-    open_page: Callable[..., Page], served: str, leases: Leases
-) -> None:
+def test_a_car_that_is_looked_at_again_is_held_though_the_end_arrives_late(open_page, served, leases):
     page = open_page(f"{served}#/alarms")
     page.add_init_script(NO_RENEWAL)
     page.reload()

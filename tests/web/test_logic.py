@@ -12,7 +12,7 @@ from iort_contract.messages.commands import check_by, decode_command
 from local.deployment import ROOT
 
 
-def test_the_page_passes_its_own_tests_and_the_robot_reads_its_commands(tmp_path: Path) -> None:
+def test_the_page_passes_its_own_tests_and_the_robot_reads_its_commands(tmp_path):
     wire = tmp_path / "wire.json"
     done = subprocess.run(
         [Path(sys.executable).with_name("node"), "station/web/test.mjs"],

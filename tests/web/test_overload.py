@@ -8,10 +8,7 @@ import json
 import select
 import socket
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack, closing
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -29,7 +26,7 @@ from iort_station.page.places import (
 )
 from iort_station.page.server import PageServer
 
-SETTINGS: dict[str, Any] = {
+SETTINGS = {
     "namespace": "iort",
     "subscribe_key": "sub-c-1",
     "origin": "127.0.0.1:9",
@@ -42,13 +39,13 @@ READ = ("history", "runs", "rejected", "insights")
 class Held:
     """Answers that end when the test ends. ``begun`` counts them, and ``ended`` is empty until then."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.begun, self.go_on = threading.Semaphore(0), threading.Event()
-        self.ended: list[str] = []
-        self.sent: list[str] = []
+        self.ended = []
+        self.sent = []
 
-    def answer(self, name: str) -> Callable[[Mapping[str, str]], dict[str, Any]]:
-        def hold(_asked: Mapping[str, str]) -> dict[str, Any]:
+    def answer(self, name):
+        def hold(_asked):
             self.begun.release()
             self.go_on.wait()
             self.ended.append(name)
@@ -56,11 +53,11 @@ class Held:
 
         return hold
 
-    def download(self, _asked: Mapping[str, str], _folder: Path) -> Path:
+    def download(self, _asked, _folder):
         self.answer("download")({})
         raise StationError("nothing is stored")
 
-    def send(self, asked: Mapping[str, str]) -> Generator[None, None, dict[str, Any]]:
+    def send(self, asked):
         """A robot that is away answers when the test ends."""
         self.sent.append(asked["robot"])
         self.begun.release()
@@ -70,14 +67,14 @@ class Held:
 
 
 @pytest.fixture
-def held() -> Iterator[Held]:
+def held():
     held = Held()
     yield held
     held.go_on.set()
 
 
 @pytest.fixture
-def page(tmp_path: Path, held: Held) -> Iterator[PageServer]:
+def page(tmp_path, held):
     (tmp_path / "index.html").write_text("<!doctype html><title>page</title>")
     quick = {name: lambda _asked: {"done": True} for name in ("motion", "socket")}
     with PageServer(
@@ -102,17 +99,17 @@ def page(tmp_path: Path, held: Held) -> Iterator[PageServer]:
 class Client:
     """Requests of one address, each over a connection of its own that stays open."""
 
-    def __init__(self, page: PageServer, stack: ExitStack, address: str = HERE) -> None:
+    def __init__(self, page, stack, address=HERE):
         self._page, self._stack, self._address = page, stack, address
         self._key = {"X-Iort-Key": page.__dict__["_key"]}
 
-    def _open(self) -> http.client.HTTPConnection:
+    def _open(self):
         connection = http.client.HTTPConnection(
             self._page.host, self._page.port, timeout=60, source_address=(self._address, 0)
         )
         return self._stack.enter_context(closing(connection))
 
-    def begin(self, path: str, asked: Mapping[str, str] | None = None, *, body: bool = True) -> Any:
+    def begin(self, path, asked=None, *, body=True):
         """Send a request, and wait for nothing."""
         connection = self._open()
         content = json.dumps(asked).encode()
@@ -124,14 +121,14 @@ class Client:
         connection.endheaders(content if asked is not None and body else None)
         return connection
 
-    def ask(self, path: str, asked: Mapping[str, str] | None = None) -> tuple[int, Any]:
+    def ask(self, path, asked=None):
         answer = self.begin(path, asked).getresponse()
         if answer.status in {429, 503}:
             assert answer.headers["Retry-After"] == "1"
         return answer.status, json.loads(answer.read())
 
 
-def test_a_stop_is_handled_while_everything_else_is_held(page: PageServer, held: Held) -> None:
+def test_a_stop_is_handled_while_everything_else_is_held(page, held):
     with ExitStack() as stack:
         for address in (HERE, "127.0.0.2", "127.0.0.3", "127.0.0.4"):
             client = Client(page, stack, address)
@@ -160,8 +157,8 @@ def test_a_stop_is_handled_while_everything_else_is_held(page: PageServer, held:
         assert held.ended == []
 
 
-def test_one_client_takes_neither_all_places_nor_those_of_other_kinds(page: PageServer, held: Held) -> None:
-    def threads() -> int:
+def test_one_client_takes_neither_all_places_nor_those_of_other_kinds(page, held):
+    def threads():
         return sum(thread.name == "page answer" for thread in threading.enumerate())
 
     with ExitStack() as stack:
@@ -183,7 +180,7 @@ def test_one_client_takes_neither_all_places_nor_those_of_other_kinds(page: Page
         assert held.ended == []
 
 
-def test_what_cannot_wait_is_refused_with_a_reason(page: PageServer, held: Held) -> None:
+def test_what_cannot_wait_is_refused_with_a_reason(page, held):
     with ExitStack() as stack:
         client = Client(page, stack)
         requests = [client.begin("/runs.json") for _ in range(ANSWERS_OF_KIND + MOST_WAITING + 1)]
@@ -197,7 +194,7 @@ def test_what_cannot_wait_is_refused_with_a_reason(page: PageServer, held: Held)
         assert [one.getresponse().status for one in requests] == [200] * len(requests)
 
 
-def test_a_send_that_waits_holds_no_place(page: PageServer, held: Held) -> None:
+def test_a_send_that_waits_holds_no_place(page, held):
     with ExitStack() as stack:
         client = Client(page, stack)
         waiting = [client.begin("/send.json", {"robot": "away"}) for _ in range(PENDING_OF_CLIENT)]
@@ -213,7 +210,7 @@ def test_a_send_that_waits_holds_no_place(page: PageServer, held: Held) -> None:
             assert json.loads(one.getresponse().read()) == {"robot": "away"}
 
 
-def test_places_are_free_again_although_their_viewers_left(page: PageServer, held: Held) -> None:
+def test_places_are_free_again_although_their_viewers_left(page, held):
     with ExitStack() as stack:
         client = Client(page, stack)
         for _ in range(ANSWERS_OF_KIND):
@@ -230,9 +227,9 @@ def test_places_are_free_again_although_their_viewers_left(page: PageServer, hel
         assert [one.getresponse().status for one in waiting] == [200, 400]
 
 
-def test_a_body_that_never_comes_ends_the_request(tmp_path: Path) -> None:
+def test_a_body_that_never_comes_ends_the_request(tmp_path):
     (tmp_path / "index.html").touch()
-    keyed: Any = {"act": lambda _: {}}
+    keyed = {"act": lambda _: {}}
     with PageServer(**SETTINGS, built=tmp_path, actions=keyed, body_s=0.01) as page, ExitStack() as stack:
         answer = Client(page, stack).begin("/act.json", {"a": "b"}, body=False).getresponse()
         assert (answer.status, answer.headers["Connection"]) == (408, "close")
@@ -252,16 +249,16 @@ def test_a_body_that_never_comes_ends_the_request(tmp_path: Path) -> None:
         ("", ""),
     ],
 )
-def test_an_ipv6_network_is_one_client(address: str, client: str) -> None:
+def test_an_ipv6_network_is_one_client(address, client):
     assert client_of(address) == client
 
 
-def test_who_has_the_fewest_places_is_next() -> None:
-    async def order() -> list[str]:
+def test_who_has_the_fewest_places_is_next():
+    async def order():
         places = Places(2, of_client=2, of_kind=2, waiting=2, wait_s=60)
-        served: list[str] = []
+        served = []
 
-        async def work(client: str) -> None:
+        async def work(client):
             await places.take(client, "read")
             served.append(client)
 
@@ -285,8 +282,8 @@ def test_who_has_the_fewest_places_is_next() -> None:
     assert asyncio.run(order()) == ["a", "a", "b", "a"]
 
 
-def test_a_place_that_does_not_come_in_time_is_refused() -> None:
-    async def wait() -> Busy:
+def test_a_place_that_does_not_come_in_time_is_refused():
+    async def wait():
         places = Places(1, of_client=1, of_kind=1, waiting=1, wait_s=0)
         await places.take("a", "read")
         with pytest.raises(Busy) as busy:

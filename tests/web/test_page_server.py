@@ -9,11 +9,8 @@ import json
 import socket
 import stat
 import threading
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, closing, suppress
 from functools import partial
-from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -26,7 +23,7 @@ from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import PageServer, on_loopback
 from testkit.ports import free_port
 
-SETTINGS: dict[str, Any] = {
+SETTINGS = {
     "namespace": "iort",
     "subscribe_key": "sub-c-1",
     "origin": "127.0.0.1:9",
@@ -35,7 +32,7 @@ SETTINGS: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page") / "web"
     folder.mkdir()
     (folder / "index.html").write_text("<!doctype html><title>page</title>")
@@ -47,19 +44,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def plain(built: Path) -> Iterator[PageServer]:
+def plain(built):
     """A page with nothing but its files."""
     with PageServer(**SETTINGS, built=built) as page:
         yield page
 
 
-def ask(
-    page: PageServer,
-    path: str,
-    method: str = "GET",
-    headers: dict[str, str] | None = None,
-    body: str | None = None,
-) -> tuple[http.client.HTTPResponse, bytes]:
+def ask(page, path, method="GET", headers=None, body=None):
     address = urlsplit(page.url)
     with closing(http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)) as connection:
         connection.request(method, path, body and body.encode(errors="surrogatepass"), headers or {})
@@ -67,11 +58,11 @@ def ask(
         return answer, answer.read()
 
 
-def config_of(page: PageServer) -> Any:
+def config_of(page):
     return json.loads(ask(page, "/config.json")[1])
 
 
-def post(page: PageServer, name: str, body: str, kind: str = "application/json", **more: str) -> Any:
+def post(page, name, body, kind="application/json", **more):
     """Ask for an action from the page's own origin."""
     headers = {"Host": "localhost", "Origin": "http://localhost", "Content-Type": kind}
     headers |= {name.replace("_", "-"): value for name, value in more.items()}
@@ -89,7 +80,7 @@ def post(page: PageServer, name: str, body: str, kind: str = "application/json",
         ("/config.json", "application/json"),
     ],
 )
-def test_files_come_with_their_type_and_the_policy(plain: PageServer, path: str, kind: str) -> None:
+def test_files_come_with_their_type_and_the_policy(plain, path, kind):
     answer, body = ask(plain, path)
     packed, packed_body = ask(plain, path, headers={"Accept-Encoding": "gzip, br"})
     head, no_body = ask(plain, path, "HEAD")
@@ -110,14 +101,14 @@ def test_files_come_with_their_type_and_the_policy(plain: PageServer, path: str,
     "path",
     ["/no", "/.", "/..", "/../secret.json", "/%2e%2e/secret.json", "//etc/passwd", "/page.js/", "/page.bin"],
 )
-def test_other_paths_are_not_served(plain: PageServer, path: str) -> None:
+def test_other_paths_are_not_served(plain, path):
     answer, body = ask(plain, path)
     assert answer.status == 404
     assert b"<" not in body
     assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
 
 
-def test_a_cached_file_is_not_sent_again(plain: PageServer) -> None:
+def test_a_cached_file_is_not_sent_again(plain):
     etag = ask(plain, "/page.js")[0].headers["ETag"]
     again, body = ask(plain, "/page.js", headers={"If-None-Match": etag, "Accept-Encoding": "gzip"})
     other, _ = ask(plain, "/style.css", headers={"If-None-Match": etag})
@@ -126,10 +117,10 @@ def test_a_cached_file_is_not_sent_again(plain: PageServer) -> None:
     assert other.status == 200
 
 
-def test_a_slow_answer_delays_neither_a_file_nor_the_shutdown(built: Path) -> None:
+def test_a_slow_answer_delays_neither_a_file_nor_the_shutdown(built):
     asked, done = threading.Event(), threading.Event()
 
-    def slow(_asked: Mapping[str, str]) -> dict[str, Any]:
+    def slow(_asked):
         asked.set()
         done.wait()
         return {}
@@ -148,7 +139,7 @@ def test_a_slow_answer_delays_neither_a_file_nor_the_shutdown(built: Path) -> No
         done.set()
 
 
-def test_the_configuration_has_the_track_of_a_file(built: Path, tmp_path: Path) -> None:
+def test_the_configuration_has_the_track_of_a_file(built, tmp_path):
     file = tmp_path / "track.csv"
     file.write_text("# x_m, y_m, w_right_m, w_left_m\n0,0,1,2\n4,0,1,2\n4,3,1,2\n0,3,1,2\n")
     with PageServer(**SETTINGS, built=built, track=load_track(file)) as page:
@@ -159,9 +150,7 @@ def test_the_configuration_has_the_track_of_a_file(built: Path, tmp_path: Path) 
         load_track(file)
 
 
-def test_a_malformed_request_is_answered_without_a_traceback(
-    built: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_malformed_request_is_answered_without_a_traceback(built, caplog, monkeypatch):
     with PageServer(**SETTINGS, built=built) as page:
         with socket.create_connection((page.host, page.port)) as sender:
             sender.sendall(b"GET / HTTP/1.1\r\nBad Header\r\n\r\n")
@@ -185,20 +174,20 @@ def test_a_malformed_request_is_answered_without_a_traceback(
         ("xgzip", False),
     ],
 )
-def test_gzip_is_sent_only_if_it_is_accepted(plain: PageServer, accepted: str, *, packed: bool) -> None:
+def test_gzip_is_sent_only_if_it_is_accepted(plain, accepted, *, packed):
     answer, _ = ask(plain, "/page.js", headers={"Accept-Encoding": accepted})
     assert (answer.headers["Content-Encoding"] == "gzip") is packed
 
 
-def test_other_methods_are_rejected(plain: PageServer) -> None:
+def test_other_methods_are_rejected(plain):
     assert ask(plain, "/", "POST")[0].status == 405
 
 
-def test_an_action_needs_a_post_of_json_from_the_page_itself(built: Path) -> None:
+def test_an_action_needs_a_post_of_json_from_the_page_itself(built):
     """A page elsewhere has neither this origin nor the key, and a form cannot send this type."""
-    done: list[Mapping[str, str]] = []
+    done = []
 
-    def act(asked: Mapping[str, str]) -> dict[str, Any]:
+    def act(asked):
         done.append(asked)
         if not asked:
             raise StationError("nothing was asked")
@@ -227,10 +216,10 @@ def test_an_action_needs_a_post_of_json_from_the_page_itself(built: Path) -> Non
     assert done == [{}, {"a": "b"}, {"c": "d"}]
 
 
-def test_the_key_comes_once_for_each_invitation_and_is_in_no_file(built: Path) -> None:
-    shown: list[str] = []
+def test_the_key_comes_once_for_each_invitation_and_is_in_no_file(built):
+    shown = []
 
-    def token(address: str) -> str:
+    def token(address):
         return json.dumps({"token": address.rpartition("=")[2]})
 
     with PageServer(**SETTINGS, actions={"act": lambda _: {}}, admitted=shown.append, built=built) as page:
@@ -254,9 +243,9 @@ def test_the_key_comes_once_for_each_invitation_and_is_in_no_file(built: Path) -
 
 
 @pytest.mark.parametrize("place", ["pages", "a" * 120])
-def test_a_command_gives_another_browser_the_key(built: Path, tmp_path: Path, place: str) -> None:
+def test_a_command_gives_another_browser_the_key(built, tmp_path, place):
     folder = tmp_path / place
-    keyed: dict[str, Any] = {"actions": {"act": lambda _: {}}, "built": built, "invitations": folder}
+    keyed = {"actions": {"act": lambda _: {}}, "built": built, "invitations": folder}
     with PageServer(**SETTINGS, **keyed) as page:
         assert config_of(page)["invite"] == "iort invite"
         # Nobody else may enter, and no file has a key.
@@ -283,21 +272,19 @@ def test_a_command_gives_another_browser_the_key(built: Path, tmp_path: Path, pl
         invitations.invite(folder)
 
 
-def test_the_socket_of_a_killed_server_is_no_page(built: Path, tmp_path: Path) -> None:
+def test_the_socket_of_a_killed_server_is_no_page(built, tmp_path):
     with socket.socket(socket.AF_UNIX) as killed:
         port = free_port()
         killed.bind(str(tmp_path / f"{port}.sock"))
     assert not invitations.served(tmp_path)
-    keyed: Any = {"act": lambda _: {}}
+    keyed = {"act": lambda _: {}}
     with PageServer(**SETTINGS, actions=keyed, built=built, invitations=tmp_path, port=port) as page:
         assert [one.url for one in invitations.served(tmp_path)] == [page.url]
 
 
-def test_a_page_without_a_folder_for_invitations_is_served(
-    built: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_page_without_a_folder_for_invitations_is_served(built, tmp_path, caplog):
     (tmp_path / "file").touch()
-    keyed: Any = {"act": lambda _: {}}
+    keyed = {"act": lambda _: {}}
     with PageServer(**SETTINGS, actions=keyed, built=built, invitations=tmp_path / "file" / "pages") as page:
         assert ask(page, "/page.js")[0].status == 200
     assert "`iort invite` does not know this page" in caplog.text
@@ -310,13 +297,13 @@ def test_a_page_without_a_folder_for_invitations_is_served(
         (("", "0.0.0.0", "::", "192.168.1.7", "lab.example", "127.0.0.1.example"), False),
     ],
 )
-def test_only_a_server_on_loopback_may_move_a_robot(hosts: Sequence[str], *, own: bool) -> None:
+def test_only_a_server_on_loopback_may_move_a_robot(hosts, *, own):
     assert [on_loopback(host) for host in hosts] == [own] * len(hosts)
 
 
-def test_without_pubnub_the_page_may_connect_to_the_broker_only(built: Path) -> None:
+def test_without_pubnub_the_page_may_connect_to_the_broker_only(built):
     broker = "wss://abc-ats.iot.eu-west-1.amazonaws.com"
-    drive: Any = {"drive": lambda _asked: {}}
+    drive = {"drive": lambda _asked: {}}
     with PageServer(namespace="iort", live="iot", broker=broker, actions=drive, built=built) as page:
         answer, body = ask(page, "/config.json")
     assert f"connect-src 'self' {broker};" in answer.headers["Content-Security-Policy"]
@@ -324,11 +311,11 @@ def test_without_pubnub_the_page_may_connect_to_the_broker_only(built: Path) -> 
     assert (known["live"], known["drivers"], known["subscribe_key"]) == ("iot", True, "")
 
 
-def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
+def test_the_page_receives_only_its_pubnub_settings(built):
     vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
     with PageServer(**SETTINGS, vehicles=vehicles, built=built) as page:
         known = config_of(page)
-    nothing: dict[str, Any] = {"actions": [], "keyed": [], "invite": "", "track": None}
+    nothing = {"actions": [], "keyed": [], "invite": "", "track": None}
     nothing |= {"live": "pubnub", "drivers": False, "identity": None}
     assert known == {**SETTINGS, "vehicles": vehicles, "token": "", "answers": False, **nothing}
 
@@ -348,12 +335,12 @@ def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
         ({"vehicles": {"car": {"speed_to_erpm_gain": float("nan")}}}, "speed_to_erpm_gain"),
     ],
 )
-def test_invalid_page_settings_are_rejected(change: dict[str, Any], says: str) -> None:
+def test_invalid_page_settings_are_rejected(change, says):
     with pytest.raises(StationError, match=says):
         config(**{**SETTINGS, **change})
 
 
-def test_a_port_that_is_taken_or_none_is_an_error(built: Path) -> None:
+def test_a_port_that_is_taken_or_none_is_an_error(built):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(StationError, match=f"port {port}: the port is in use"):
@@ -363,12 +350,12 @@ def test_a_port_that_is_taken_or_none_is_an_error(built: Path) -> None:
             PageServer(**SETTINGS, port=port, built=built).start()
 
 
-def test_an_error_explains_how_to_build_the_page(tmp_path: Path) -> None:
+def test_an_error_explains_how_to_build_the_page(tmp_path):
     with pytest.raises(StationError, match="make setup"):
         PageServer(**SETTINGS, built=tmp_path)
 
 
-def test_the_port_is_free_after_the_shutdown_although_a_connection_is_silent(built: Path) -> None:
+def test_the_port_is_free_after_the_shutdown_although_a_connection_is_silent(built):
     page = PageServer(**SETTINGS, built=built).start()
     with socket.create_connection(("127.0.0.1", page.port)):
         page.stop()
@@ -378,7 +365,7 @@ def test_the_port_is_free_after_the_shutdown_although_a_connection_is_silent(bui
 
 
 @pytest.mark.skipif(not socket.has_ipv6, reason="this machine has no IPv6")
-def test_the_server_supports_ipv6(built: Path) -> None:
+def test_the_server_supports_ipv6(built):
     try:
         page = PageServer(**SETTINGS, built=built, host="::1").start()
     except StationError as error:
@@ -391,7 +378,7 @@ def test_the_server_supports_ipv6(built: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_every_path_rejects_a_foreign_host_name(built: Path, host: str) -> None:
+def test_every_path_rejects_a_foreign_host_name(built, host):
     """DNS rebinding: a foreign page points its own name to this server to read the answers."""
     answers = {"double": lambda asked: {"twice": 2 * int(asked["n"])}}
     others = (
@@ -415,8 +402,8 @@ def test_every_path_rejects_a_foreign_host_name(built: Path, host: str) -> None:
                 assert ask(page, path, headers={"Host": name})[0].status == known, name
 
 
-def test_an_answer_is_json_with_null_for_what_json_has_not_and_an_error_too(built: Path) -> None:
-    def answer(asked: Mapping[str, str]) -> dict[str, Any]:
+def test_an_answer_is_json_with_null_for_what_json_has_not_and_an_error_too(built):
+    def answer(asked):
         if "n" not in asked:
             raise StationError("the request names no n")
         return {"mean": [1.5, float("inf"), None], "of": {"x": float("nan")}, "n": int(asked["n"])}
@@ -429,7 +416,7 @@ def test_an_answer_is_json_with_null_for_what_json_has_not_and_an_error_too(buil
     assert (bad.status, json.loads(reason)) == (400, {"error": "the request names no n"})
 
 
-def test_the_pubnub_sdk_is_served_unmodified_with_its_licence() -> None:
+def test_the_pubnub_sdk_is_served_unmodified_with_its_licence():
     modules = BUILT.parents[3] / "node_modules" / "pubnub"
     if not (BUILT / "index.html").is_file():
         pytest.skip("the live page is not built: npm run build")
@@ -441,17 +428,17 @@ def test_the_pubnub_sdk_is_served_unmodified_with_its_licence() -> None:
 class Failing(BackgroundServer):
     """Its loop and its look for silent connections fail once each, at the second time."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__("127.0.0.1", 0, idle_s=30.0)
         self.starts, self.looks = 0, 0
         self.fail, self.again, self.looked = asyncio.Event(), threading.Event(), threading.Event()
 
-    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+    async def handle(self, request):
         self.fail.set()
         return web.Response()
 
     @asynccontextmanager
-    async def beside(self) -> AsyncIterator[None]:
+    async def beside(self):
         self.starts += 1
         if self.starts > 1:
             self.again.set()
@@ -466,7 +453,7 @@ class Failing(BackgroundServer):
         except asyncio.CancelledError as cancelled:
             raise RuntimeError("a fault of the loop") from cancelled
 
-    async def pause(self, seconds: float) -> None:
+    async def pause(self, seconds):
         self.looks += 1
         if self.looks == 1:
             raise RuntimeError("a fault of the look")
@@ -474,10 +461,8 @@ class Failing(BackgroundServer):
         await super().pause(seconds)
 
 
-def test_each_task_of_a_server_goes_on_after_an_unexpected_exception(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    def ask_it(server: Failing) -> int:
+def test_each_task_of_a_server_goes_on_after_an_unexpected_exception(caplog):
+    def ask_it(server):
         with closing(http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)) as connection:
             connection.request("GET", "/")
             return connection.getresponse().status
@@ -498,10 +483,10 @@ def test_each_task_of_a_server_goes_on_after_an_unexpected_exception(
         server.stop()
 
 
-def test_a_server_that_cannot_start_says_so() -> None:
+def test_a_server_that_cannot_start_says_so():
     class Broken(Failing):
         @asynccontextmanager
-        async def beside(self) -> AsyncIterator[None]:
+        async def beside(self):
             raise RuntimeError("a fault at the start")
             yield
 

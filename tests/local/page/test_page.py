@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
@@ -17,7 +16,6 @@ from iort_station.cloud import EMBEDDED
 from iort_station.page.answers import actions, answers
 from iort_station.page.pubnub import Listener
 from iort_station.page.server import PageServer
-from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from testkit.waiting import until
 from tests.browser import plain, shown
@@ -28,7 +26,7 @@ RATE_HZ, DRIVE_S = 50, 4
 
 
 @contextmanager
-def watching(embedded: EmbeddedCloud) -> Iterator[subprocess.Popen[str]]:
+def watching(embedded):
     """`iort watch --json`, once it listens."""
     command = [Path(sys.executable).parent / "iort", "--local", "--embedded", embedded.folder / EMBEDDED.name]
     process = subprocess.Popen(
@@ -42,7 +40,7 @@ def watching(embedded: EmbeddedCloud) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def served(embedded: EmbeddedCloud) -> PageServer:
+def served(embedded):
     return PageServer(
         namespace=embedded.namespace,
         **embedded.keys.reading(),

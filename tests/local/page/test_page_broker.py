@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.limits import LIVE_MAX_RATE_HZ, Value
+from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import LIVE, build_topic
 from iort_station.page import motion
@@ -19,24 +18,16 @@ from testkit.car import AgentProcess
 from testkit.waiting import until
 from tests.browser import plain, show, shown
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from playwright.sync_api import Page
-
-    from iort_station.cloud import Cloud
-    from local.cloud import EmbeddedCloud
-
-SAMPLE: dict[str, Value] = {"voltage_input": 11.65, "speed": 4000, "duty_cycle": 0.1, "temp_motor": -300.0}
+SAMPLE = {"voltage_input": 11.65, "speed": 4000, "duty_cycle": 0.1, "temp_motor": -300.0}
 
 
 class Car:
     """Sends live messages as an agent does, straight to the broker."""
 
-    def __init__(self, cloud: Cloud, name: str) -> None:
+    def __init__(self, cloud, name):
         self.cloud, self.name, self.seq = cloud, name, 0
 
-    def send(self, sample: Mapping[str, Value] = SAMPLE) -> dict[str, Any]:
+    def send(self, sample=SAMPLE):
         now_us = time.time_ns() // 1000
         live = LiveSample("0a1b2c3d", self.seq, now_us - 3_000, now_us - 1_000, sample, offset_us=0)
         topic = build_topic(LIVE, self.name, VESC_STREAM, self.cloud.namespace)
@@ -45,7 +36,7 @@ class Car:
         return {"robot": self.name, "stream": VESC_STREAM, "seq": live.seq}
 
 
-def served(cloud: Cloud) -> PageServer:
+def served(cloud):
     return PageServer(
         namespace=cloud.namespace,
         **motion.reaching(cloud, "iot"),
@@ -54,9 +45,7 @@ def served(cloud: Cloud) -> PageServer:
     )
 
 
-def test_the_page_wakes_a_car_over_its_own_connection_and_lets_it_sleep(
-    embedded: EmbeddedCloud, bundle: Callable[..., Any], open_page: Callable[..., Page]
-) -> None:
+def test_the_page_wakes_a_car_over_its_own_connection_and_lets_it_sleep(embedded, bundle, open_page):
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}
     car = bundle(sources=[source], live={"when": "watched"})
     count = f"iort.robots['{car.robot}']?.streams.{VESC_STREAM}.received ?? 0"
@@ -80,9 +69,7 @@ def test_the_page_wakes_a_car_over_its_own_connection_and_lets_it_sleep(
         until(lambda: page.evaluate(f"iort.robots['{car.robot}'].state") == "idle", "the car to sleep again")
 
 
-def test_a_slow_connection_that_drops_is_opened_anew(
-    embedded: EmbeddedCloud, open_page: Callable[..., Page]
-) -> None:
+def test_a_slow_connection_that_drops_is_opened_anew(embedded, open_page):
     relay = int(embedded.cloud.websocket_url.split(":")[2].partition("/")[0])
     with Proxy("127.0.0.1", relay, latency_s=0.2) as proxy:
         cloud = replace(embedded.cloud, websocket=f"ws://127.0.0.1:{proxy.port}/mqtt")
@@ -103,9 +90,7 @@ def test_a_slow_connection_that_drops_is_opened_anew(
             assert shown(page, "voltage_input") == "12.50"
 
 
-def test_a_site_without_a_server_listens_as_everybody_and_wakes_nobody(
-    embedded: EmbeddedCloud, open_page: Callable[..., Page]
-) -> None:
+def test_a_site_without_a_server_listens_as_everybody_and_wakes_nobody(embedded, open_page):
     with PageServer(
         namespace=embedded.namespace,
         live="iot",

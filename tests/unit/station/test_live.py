@@ -8,7 +8,6 @@ import time
 from collections import defaultdict
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from botocore.exceptions import ClientError
@@ -16,7 +15,7 @@ from rich.console import Console
 
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.limits import ContractError, Value
+from iort_contract.limits import ContractError
 from iort_contract.messages.live import (
     VIEW_LEASE_MS,
     Lease,
@@ -119,12 +118,12 @@ def test_a_viewers_thread_goes_on_after_an_unexpected_exception(caplog):
 NOW_US = 1_700_000_000_000_000
 
 
-def update(robot: str = "car1", **sample: Value) -> dict[str, Any]:
+def update(robot="car1", **sample):
     live = LiveSample("0badcafe", 0, NOW_US - 12_000, NOW_US - 10_000, sample)
     return live_update(robot, VESC_STREAM, live, NOW_US // 1000 - 6, NOW_US - 2_000)
 
 
-def text(fleet: FleetWatch, width: int = 120, now_us: int = NOW_US) -> str:
+def text(fleet, width=120, now_us=NOW_US):
     console = Console(width=width, file=None, record=True, quiet=False, force_terminal=False)
     with console.capture() as captured:
         console.print(fleet.table(now_us, width))
@@ -185,7 +184,7 @@ def test_the_table_fits_a_narrow_terminal():
 def test_an_invalid_update_is_counted():
     fleet = FleetWatch({})
     good = update()
-    bad: list[Any] = [7, None, [], {}, {**good, "v": 9}, {**good, "robot": "[red]x"}, {**good, "hops": {}}]
+    bad = [7, None, [], {}, {**good, "v": 9}, {**good, "robot": "[red]x"}, {**good, "hops": {}}]
     bad += [{**good, "t": "1"}, {**good, "sample": 3}]
     for each in bad:
         fleet.take(each, 0, NOW_US)
@@ -209,16 +208,16 @@ class ViewedCloud:
 
     namespace = "iort"
 
-    def __init__(self, *, refuses: bool = False) -> None:
+    def __init__(self, *, refuses=False):
         self.refuses = refuses
-        self.heard: dict[str, list[Lease]] = defaultdict(list)
+        self.heard = defaultdict(list)
         self.renewed = threading.Semaphore(0)
 
-    def client(self, service: str) -> ViewedCloud:
+    def client(self, service):
         assert service == "iot-data"
         return self
 
-    def publish(self, *, topic: str, qos: int, payload: bytes) -> None:
+    def publish(self, *, topic, qos, payload):
         if self.refuses:
             raise ClientError({"Error": {"Code": "ForbiddenException", "Message": "no"}}, "Publish")
         assert qos == 0
@@ -228,8 +227,8 @@ class ViewedCloud:
         self.renewed.release()
 
 
-def test_a_viewer_renews_its_leases_and_ends_them() -> None:
-    cloud: Any = ViewedCloud()
+def test_a_viewer_renews_its_leases_and_ends_them():
+    cloud = ViewedCloud()
     with viewing.Viewer(cloud, ["a", "b"], rate_hz=2, broker=True, every_s=0.01) as viewer:
         assert set(cloud.heard) == {"a", "b"}, "awake at once"
         for _ in range(6):
@@ -244,8 +243,8 @@ def test_a_viewer_renews_its_leases_and_ends_them() -> None:
         assert ended.lease_ms == 0
 
 
-def test_a_robot_that_comes_is_woken_and_one_that_goes_is_let_go() -> None:
-    cloud: Any = ViewedCloud()
+def test_a_robot_that_comes_is_woken_and_one_that_goes_is_let_go():
+    cloud = ViewedCloud()
     online = ["a"]
     with viewing.Viewer(cloud, lambda: online, every_s=0.01):
         online[:] = ["b"]
@@ -254,12 +253,12 @@ def test_a_robot_that_comes_is_woken_and_one_that_goes_is_let_go() -> None:
     assert cloud.heard["a"][-1].lease_ms == 0
 
 
-def test_a_viewer_whose_network_is_gone_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viewer_whose_network_is_gone_ends_soon(monkeypatch):
     monkeypatch.setattr(viewing, "_GOODBYE_S", 0.1)
-    cloud: Any = ViewedCloud()
+    cloud = ViewedCloud()
     asked, network = threading.Semaphore(0), threading.Event()
 
-    def robots() -> list[str]:
+    def robots():
         asked.release()
         # The second time it hangs.
         assert not cloud.heard or network.wait(60)
@@ -275,8 +274,8 @@ def test_a_viewer_whose_network_is_gone_ends_soon(monkeypatch: pytest.MonkeyPatc
     viewer._thread.join(10)
 
 
-def test_who_may_not_wake_robots_is_told_and_looks_on() -> None:
-    cloud: Any = ViewedCloud(refuses=True)
+def test_who_may_not_wake_robots_is_told_and_looks_on():
+    cloud = ViewedCloud(refuses=True)
     with viewing.Viewer(cloud, ["a"]) as viewer:
         assert "cannot be woken" in viewer.problem
     with pytest.raises(StationError, match="cannot be woken"):
@@ -284,7 +283,7 @@ def test_who_may_not_wake_robots_is_told_and_looks_on() -> None:
     assert viewing.view(cloud, [], LEASE) == 0
 
 
-def test_a_car_that_nobody_holds_awake_is_online_until_its_next_message_is_due() -> None:
+def test_a_car_that_nobody_holds_awake_is_online_until_its_next_message_is_due():
     live = LiveSample("0badcafe", 0, 1_000_000, 1_000_000, {"speed": 1})
     fleet = FleetWatch({})
     fleet.take(live_update("idle", "vesc", replace(live, next_ms=10_000), 1000, 1_000_000), 0, 1_000_000)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -13,21 +12,11 @@ from testkit.waiting import GUARD_S, until
 from tests.browser import plain, show
 from tests.unit.station.data.test_queries import START
 from tests.unit.station.data.test_runs import driven_cloud
-from tests.web.cars import SAMPLE, Car
+from tests.web.cars import SAMPLE
 from tests.web.lab import NOW_S, VIEWS, Lab, insights
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
 
-    from playwright.sync_api import Page
-
-    from iort_contract.messages.insights import InsightsAnswer
-    from iort_station.page.server import PageServer
-
-
-def test_every_view_counts_the_alarms_and_each_says_what_to_do(
-    open_page: Callable[..., Page], lab: Lab, server: PageServer
-) -> None:
+def test_every_view_counts_the_alarms_and_each_says_what_to_do(open_page, lab, server):
     page = open_page(server.url)
     badge = page.locator("#alarms")
     for view, (address, _) in VIEWS.items():
@@ -63,9 +52,7 @@ def test_every_view_counts_the_alarms_and_each_says_what_to_do(
     assert page.locator("#acknowledge-as").input_value() == "grace"
 
 
-def test_live_values_raise_the_alarms_of_cars(
-    open_page: Callable[..., Page], lab: Lab, server: PageServer, car: Car
-) -> None:
+def test_live_values_raise_the_alarms_of_cars(open_page, lab, server, car):
     lab.alarms = [{**one, "state": "OK"} for one in lab.alarms]
     page = open_page(f"{server.url}#/alarms")
     until(lambda: "not raised" in page.inner_text(".quiet"), "the cloud's alarms")
@@ -104,28 +91,26 @@ WIDGET = {
 class Logs:
     """A server whose queries wait until the test releases them; it records the requests."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.dashboards = 0
-        self.queries: list[dict[str, str]] = []
+        self.queries = []
         self.done = threading.Event()
 
-    def dashboard(self, asked: Any) -> dict[str, Any]:
+    def dashboard(self, asked):
         self.dashboards += 1
         widget = {**WIDGET, "period_s": 300, "series": [], "alarms": []}
         return {"name": asked["name"], "from_s": 0, "to_s": 60 * int(asked["minutes"]), "widgets": [widget]}
 
-    def log(self, asked: Any) -> dict[str, Any]:
+    def log(self, asked):
         self.queries.append(dict(asked))
         assert self.done.wait(GUARD_S)
         rows = [[f"{asked['minutes']}\n  in details"]]
         return {"columns": ["@message"], "rows": rows, "found": 1, "from_s": 0, "to_s": 60}
 
 
-def test_the_page_waits_for_a_log_query_across_dashboard_updates(
-    open_page: Callable[..., Page], serve: Callable[..., PageServer]
-) -> None:
+def test_the_page_waits_for_a_log_query_across_dashboard_updates(open_page, serve):
     logs = Logs()
-    answers: dict[str, Any] = {
+    answers = {
         "dashboards": lambda _: {"dashboards": ["iort-platform"]},
         "dashboard": logs.dashboard,
         "log": logs.log,
@@ -158,58 +143,56 @@ END = START + 90_000_000
 class Analysed(Lab):
     """A lab with the driven laps of `driven_cloud`, which are one drive, or one run until it is analysed."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.analysed = True
         # The analysis runs until the test has seen its progress.
         self.ends = False
 
-    def answers(self) -> dict[str, Any]:
+    def answers(self):
         extent = {"from_us": START, "to_us": END}
         part = {**extent, "batches": 90, "samples": 4500}
         run = {**extent, "run": "0badcafe", "state": "ended", "lost": 0, "streams": {"vesc": part}}
         runs = {"runs": [run], "older": False, "streams": {"vesc": extent}}
         told = {"insights": self.insights, "runs": lambda _: runs, "analysis": self.progress}
-        cloud: Any = driven_cloud()
+        cloud = driven_cloud()
         of_car = {
             name: lambda asked, answer=answer: answer(cloud, {**asked, "robot": "car"})
             for name, answer in (("laps", laps.laps), ("delta", laps.delta))
         }
         return {**super().answers(), **told, **of_car}
 
-    def analyse(self, asked: Mapping[str, str]) -> dict[str, str]:
+    def analyse(self, asked):
         self.asked.append(dict(asked))
         return {"run": "iort-1"}
 
-    def progress(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+    def progress(self, _asked):
         self.analysed = self.ends
         return {"running": not self.analysed, "drives": 1, "done": int(self.analysed)}
 
-    def insights(self, asked: Mapping[str, str]) -> InsightsAnswer:
+    def insights(self, asked):
         told = insights(asked)
         if not self.analysed:
             return {**told, "findings": [], "drives": []}
         newest = {**told["drives"][0], "from_us": START, "to_us": END}
-        return {**told, "drives": [newest, *told["drives"][6:]]}  # type: ignore[typeddict-item]  # of another time
+        return {**told, "drives": [newest, *told["drives"][6:]]}
 
 
 @pytest.fixture
-def analysed() -> Analysed:
+def analysed():
     return Analysed()
 
 
 @pytest.fixture
-def analyses(serve: Callable[..., PageServer], analysed: Analysed) -> PageServer:
+def analyses(serve, analysed):
     return serve(answers=analysed.answers(), actions={"analyse": analysed.analyse})
 
 
-def laps_found(page: Page) -> None:
+def laps_found(page):
     until(lambda: page.locator(".laps-table tbody tr").count() >= 6, "the laps")
 
 
-def test_a_finding_has_its_interval_its_advice_and_its_evidence(
-    open_page: Callable[..., Page], analyses: PageServer
-) -> None:
+def test_a_finding_has_its_interval_its_advice_and_its_evidence(open_page, analyses):
     page = open_page(analyses.invitation("#/insights/car-1"), timezone_id="UTC")
     finding = page.locator(".finding[data-severity=warning]")
     finding.wait_for()
@@ -222,9 +205,7 @@ def test_a_finding_has_its_interval_its_advice_and_its_evidence(
     assert page.url.endswith("&fields=voltage_input,current_input")
 
 
-def test_two_laps_are_compared_and_all_their_fields_are_a_click_away(
-    open_page: Callable[..., Page], analyses: PageServer
-) -> None:
+def test_two_laps_are_compared_and_all_their_fields_are_a_click_away(open_page, analyses):
     page = open_page(analyses.invitation("#/insights/car-1"), timezone_id="UTC")
     laps_found(page)
     times = [float(text.split()[0]) for text in page.locator(".laps-table td:nth-child(4)").all_inner_texts()]
@@ -251,8 +232,8 @@ def test_two_laps_are_compared_and_all_their_fields_are_a_click_away(
 
 
 def test_before_the_first_analysis_the_page_says_so_and_shows_the_laps_of_the_newest_run(
-    open_page: Callable[..., Page], analyses: PageServer, analysed: Analysed
-) -> None:
+    open_page, analyses, analysed
+):
     analysed.analysed = False
     page = open_page(analyses.invitation("#/insights/car-1"), timezone_id="UTC")
     laps_found(page)

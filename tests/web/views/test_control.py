@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from iort_station.errors import StationError
 from testkit.waiting import until
 from tests.browser import drawn, show
-from tests.web.lab import NOW_S, Lab
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from playwright.sync_api import Page
-
-    from iort_station.page.server import PageServer
-    from tests.web.cars import Car
+from tests.web.lab import NOW_S
 
 
-def setting(name: str, kind: str, value: str, *, desired: bool = False) -> dict[str, Any]:
+def setting(name, kind, value, *, desired=False):
     entry = {"name": name, "kind": kind, "value": value, "desired": desired, "pending": None, "reason": ""}
     return {**entry, "low": 0.1, "high": 10.0, "unit": "Hz" if kind == "number" else "", "names": []}
 
@@ -29,20 +20,20 @@ def setting(name: str, kind: str, value: str, *, desired: bool = False) -> dict[
 class Robot:
     """Answers commands as told, and keeps them."""
 
-    def __init__(self) -> None:
-        self.sent: list[dict[str, Any]] = []
+    def __init__(self):
+        self.sent = []
         self.online = True
         entries = (
             setting("live.rate_hz", "number", "10"),
             setting("fields.vesc", "fields", "speed", desired=True),
         )
         self.entries = {entry["name"]: entry for entry in entries}
-        self.answer: dict[str, Any] = {"accepted": True, "reason": "", "after_ms": 400}
+        self.answer = {"accepted": True, "reason": "", "after_ms": 400}
 
-    def settings(self, _asked: Mapping[str, str]) -> dict[str, Any]:
+    def settings(self, _asked):
         return {"settings": [dict(entry) for entry in self.entries.values()], "online": self.online}
 
-    def set(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def set(self, asked):
         """Take all but rates above 5 Hz."""
         self.sent.append(dict(asked))
         entry = self.entries[asked["name"]]
@@ -56,7 +47,7 @@ class Robot:
             entry |= {"value": asked["value"], "desired": True}
         return self.settings({})
 
-    def send(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def send(self, asked):
         self.sent.append({**asked, "message": json.loads(asked["message"])})
         if asked["command"] == "nothing":
             raise StationError("there is no such command")
@@ -64,18 +55,16 @@ class Robot:
 
 
 @pytest.fixture
-def robot() -> Robot:
+def robot():
     return Robot()
 
 
 @pytest.fixture
-def invite(serve: Callable[..., PageServer], robot: Robot) -> Callable[[str], str]:
+def invite(serve, robot):
     return serve(actions={"send": robot.send, "settings": robot.settings, "set": robot.set}).invitation
 
 
-def test_a_command_is_sent_and_its_answer_shown(
-    open_page: Callable[..., Page], invite: Callable[[str], str], robot: Robot, car: Car
-) -> None:
+def test_a_command_is_sent_and_its_answer_shown(open_page, invite, robot, car):
     page = open_page(invite("#/car/car-1"))
     show(page, car.send())
     page.get_by_role("heading", name="Commands").click()
@@ -107,9 +96,7 @@ def test_a_command_is_sent_and_its_answer_shown(
     until(lambda: said.inner_text() == "there is no such command", "the server's refusal")
 
 
-def test_a_setting_is_checked_changed_and_reset(
-    open_page: Callable[..., Page], invite: Callable[[str], str], robot: Robot, car: Car
-) -> None:
+def test_a_setting_is_checked_changed_and_reset(open_page, invite, robot, car):
     page = open_page(invite("#/car/car-1"))
     show(page, car.send())
     page.get_by_role("heading", name="Settings").click()
@@ -141,9 +128,7 @@ def test_a_setting_is_checked_changed_and_reset(
     assert fields.locator("input").input_value() == ""
 
 
-def test_a_note_is_written_marked_in_the_history_and_deleted(
-    open_page: Callable[..., Page], lab: Lab, server: PageServer
-) -> None:
+def test_a_note_is_written_marked_in_the_history_and_deleted(open_page, lab, server):
     page = open_page(server.invitation())
     page.goto(
         f"{server.url}#/history/car-1?stream=vesc&from=2026-05-04T10:00:00.000Z"
@@ -172,9 +157,7 @@ def test_a_note_is_written_marked_in_the_history_and_deleted(
     assert [one["text"] for one in lab.notes] == ["changed the left front tyre"]
 
 
-def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
-    open_page: Callable[..., Page], lab: Lab, server: PageServer
-) -> None:
+def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(open_page, lab, server):
     lab.confirms = False
     page = open_page(server.invitation())
     words = page.locator(".stop-words")
@@ -213,9 +196,7 @@ def test_one_press_stops_a_car_or_the_fleet_and_only_a_release_asks(
     page.get_by_text("The page's server does not answer: nobody can be stopped here").wait_for()
 
 
-def test_only_a_browser_that_was_invited_may_act(
-    open_page: Callable[..., Page], invite: Callable[[str], str], car: Car
-) -> None:
+def test_only_a_browser_that_was_invited_may_act(open_page, invite, car):
     address = invite("#/car/car-1")
     page = open_page(address.partition("?")[0])
     show(page, car.send())
@@ -244,61 +225,59 @@ def test_only_a_browser_that_was_invited_may_act(
     assert "Read-only: this address was used before" in other.inner_text(".read-only")
 
 
-PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 
 
 class Fingers:
     """Fingers on a screen: each by its number, where it is."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page):
         self._send = page.context.new_cdp_session(page).send
-        self._down: dict[int, tuple[float, float]] = {}
+        self._down = {}
 
-    def put(self, finger: int, x: float, y: float) -> None:
+    def put(self, finger, x, y):
         """Put it down, or move it."""
         kind = "touchMove" if finger in self._down else "touchStart"
         self._down[finger] = (x, y)
         self._touch(kind, self._down)
 
-    def lift(self, finger: int) -> None:
+    def lift(self, finger):
         self._touch("touchEnd", {finger: self._down.pop(finger)})
 
-    def cancel(self) -> None:
+    def cancel(self):
         """The system takes all of them: a call, a gesture of its own."""
         self._down.clear()
         self._touch("touchCancel", {})
 
-    def _touch(self, kind: str, fingers: Mapping[int, tuple[float, float]]) -> None:
+    def _touch(self, kind, fingers):
         points = [{"id": finger, "x": x, "y": y} for finger, (x, y) in fingers.items()]
         self._send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
 
-def at_the_wheel(page: Page, car: Car) -> None:
+def at_the_wheel(page, car):
     show(page, car.send())
     page.get_by_role("button", name="Take the wheel").click()
     page.locator(".deadman").scroll_into_view_if_needed()
 
 
-def held(page: Page) -> bool:
+def held(page):
     return page.get_attribute(".deadman", "data-held") == "true"
 
 
-def knob(page: Page) -> tuple[float, float]:
+def knob(page):
     """Where it is, to the right and ahead."""
     where = "(node) => ['--x', '--y'].map((name) => Number(node.style.getPropertyValue(name)))"
     x, y = page.locator(".knob").evaluate(where)
     return x, -y
 
 
-def middle(page: Page, selector: str) -> tuple[float, float]:
+def middle(page, selector):
     box = page.locator(selector).bounding_box()
     assert box is not None
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
-def test_a_finger_that_is_lifted_or_lost_lets_go(
-    open_page: Callable[..., Page], server: PageServer, car: Car
-) -> None:
+def test_a_finger_that_is_lifted_or_lost_lets_go(open_page, server, car):
     page = open_page(server.invitation("#/car/car-1"), **PHONE)
     at_the_wheel(page, car)
     fingers, button, stick = Fingers(page), middle(page, ".deadman"), middle(page, ".stick")
@@ -325,19 +304,17 @@ def test_a_finger_that_is_lifted_or_lost_lets_go(
     until(lambda: not held(page), "the touch to be lost")
 
 
-def test_a_gamepad_that_is_let_go_or_lost_lets_go(
-    open_page: Callable[..., Page], server: PageServer, car: Car
-) -> None:
+def test_a_gamepad_that_is_let_go_or_lost_lets_go(open_page, server, car):
     page = open_page(server.invitation("#/car/car-1"))
     page.evaluate("navigator.getGamepads = () => [null, window.gamepad ?? null]")
 
-    def pad(*axes: str, pressed: bool = False) -> None:
+    def pad(*axes, pressed=False):
         held = f"{{ pressed: {str(pressed).lower()} && i === 5 }}"
         buttons = f"Array.from({{ length: 8 }}, (_, i) => ({held}))"
         told = f"connected: true, mapping: 'standard', axes: [{', '.join(axes)}], buttons: {buttons}"
         page.evaluate(f"window.gamepad = {{ {told} }}")
 
-    def phase(wanted: str) -> None:
+    def phase(wanted):
         """A hold that cannot begin, because there is no broker, is over until it is let go."""
         page.locator(f".drive[data-phase={wanted}]").wait_for()
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import pytest
 
 from iort_agent.sources.sim.driver import HALL
@@ -12,15 +10,6 @@ from testkit.waiting import until
 from tests.browser import drawn, plain, show, shown
 from tests.web.cars import GAIN, SAMPLE, Car
 from tests.web.lab import past
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from playwright.sync_api import Page
-
-    from iort_contract.messages.page import HistoryAnswer
-    from iort_station.page.server import PageServer
-    from local.pubnub import PubNubStandIn
 
 OFF_MS = 1_700_000_000_000
 REGISTERED = {
@@ -32,13 +21,13 @@ TAGS = {"car-1": {"lab": "north"}, "car-2": {"lab": "south", "team": "blue"}, "c
 
 
 @pytest.fixture
-def vehicles() -> dict[str, Any]:
+def vehicles():
     return {}
 
 
 @pytest.fixture
-def served(serve: Callable[..., PageServer], vehicles: dict[str, Any]) -> str:
-    answers: dict[str, Any] = {
+def served(serve, vehicles):
+    answers = {
         "robots": lambda _: {"robots": REGISTERED},
         "tags": lambda _: {"tags": TAGS},
         "vehicles": lambda _: {"vehicles": vehicles},
@@ -48,9 +37,7 @@ def served(serve: Callable[..., PageServer], vehicles: dict[str, Any]) -> str:
     return serve(answers=answers).url
 
 
-def test_cars_that_are_not_heard_are_listed_until_they_send(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn, served: str
-) -> None:
+def test_cars_that_are_not_heard_are_listed_until_they_send(open_page, pubnub, served):
     page = open_page(served, timezone_id="UTC")
     absent = page.locator("[data-absent]")
     until(lambda: absent.count() == 3, "the cars that are away")
@@ -77,9 +64,7 @@ def test_cars_that_are_not_heard_are_listed_until_they_send(
     assert "Registered: car-2, car-3, car-10." in page.inner_text("#empty")
 
 
-def test_a_car_registered_after_the_page_opened_shows_metres_per_second(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn, served: str, vehicles: dict[str, Any]
-) -> None:
+def test_a_car_registered_after_the_page_opened_shows_metres_per_second(open_page, pubnub, served, vehicles):
     page = open_page(f"{served}#/car/car-2")
     car, speed = Car(pubnub, "car-2"), page.locator(".gauge").first
     show(page, car.send())
@@ -91,7 +76,7 @@ def test_a_car_registered_after_the_page_opened_shows_metres_per_second(
     until(lambda: speed.locator(".gauge-scale").inner_text().split() == ["\u22123", "4"], "the new ends")
 
 
-def test_the_fleet_is_sorted_and_usable_by_keyboard(page: Page, car: Car, url: str) -> None:
+def test_the_fleet_is_sorted_and_usable_by_keyboard(page, car, url):
     page.goto(f"{url}#/")
     fleet = {name: Car(car.pubnub, name) for name in ("car-10", "car-2", "car-1")}
     for name, each in fleet.items():
@@ -100,7 +85,7 @@ def test_the_fleet_is_sorted_and_usable_by_keyboard(page: Page, car: Car, url: s
     assert [cards.nth(i).get_attribute("data-robot") for i in range(3)] == ["car-1", "car-2", "car-10"]
     until(lambda: "10.0" in cards.nth(2).inner_text(), "the card's values")
 
-    def all_online() -> bool:
+    def all_online():
         # On a slow machine the first is silent when the last is shown.
         for name, each in fleet.items():
             each.send({**SAMPLE, "voltage_input": int(name[4:])})
@@ -119,7 +104,7 @@ def test_the_fleet_is_sorted_and_usable_by_keyboard(page: Page, car: Car, url: s
     until(lambda: page.url.startswith(f"{url}#/car/car-10"), "the next car")
     until(lambda: shown(page, "voltage_input") == "10.00", "the car's own values")
 
-    def left() -> bool:
+    def left():
         # A busy browser may take the key for its own, which stops what loads.
         page.keyboard.press("Escape")
         return page.url == f"{url}#/"
@@ -127,9 +112,7 @@ def test_the_fleet_is_sorted_and_usable_by_keyboard(page: Page, car: Car, url: s
     until(left, "the fleet again")
 
 
-def test_cars_are_found_sorted_and_grouped_and_the_address_says_so(
-    open_page: Callable[..., Page], pubnub: PubNubStandIn, served: str
-) -> None:
+def test_cars_are_found_sorted_and_grouped_and_the_address_says_so(open_page, pubnub, served):
     page = open_page(served)
     for name, volts in (("car-1", 11.0), ("car-2", 9.0), ("car-10", 10.0)):
         show(page, Car(pubnub, name).send({**SAMPLE, "voltage_input": volts}))
@@ -154,10 +137,10 @@ TITLES = "[...document.querySelectorAll('#car .board .charts > :not([hidden])')]
 class Recorded:
     """A server with a row each 0.1 s of the past; it keeps what was asked."""
 
-    def __init__(self) -> None:
-        self.asked_s: list[float] = []
+    def __init__(self):
+        self.asked_s = []
 
-    def history(self, asked: Any) -> HistoryAnswer:
+    def history(self, asked):
         first, last = (int(asked[name]) / 1e6 for name in ("from_us", "to_us"))
         if asked["stream"] == LOG_STREAM:
             line = {"level": "warning", "logger": "iort_agent.mqtt", "text": "connection lost", "left_out": 0}
@@ -168,13 +151,13 @@ class Recorded:
 
 
 @pytest.fixture
-def recorded() -> Recorded:
+def recorded():
     return Recorded()
 
 
 @pytest.fixture
-def board(serve: Callable[..., PageServer], recorded: Recorded) -> str:
-    answers: dict[str, Any] = {
+def board(serve, recorded):
+    answers = {
         "history": recorded.history,
         "vehicles": lambda _: {"vehicles": {}},
         "robots": lambda _: {"robots": {}},
@@ -183,13 +166,11 @@ def board(serve: Callable[..., PageServer], recorded: Recorded) -> str:
     return serve(answers=answers, track=HALL).url
 
 
-def rows(page: Page) -> int:
+def rows(page):
     return int(page.evaluate("iort.robots['car-1'].streams.vesc.kept.rows"))
 
 
-def test_charts_begin_with_what_was_recorded(
-    open_page: Callable[..., Page], board: str, recorded: Recorded, car: Car
-) -> None:
+def test_charts_begin_with_what_was_recorded(open_page, board, recorded, car):
     page = open_page(f"{board}#/car/car-1?window=300&charts=battery")
     show(page, car.send())
     until(lambda: rows(page) > 2900, "the last five minutes")
@@ -207,9 +188,7 @@ def test_charts_begin_with_what_was_recorded(
     until(lambda: rows(page) < 1000, "the fleet's view to need less")
 
 
-def test_the_viewers_charts_are_kept_and_shared(
-    open_page: Callable[..., Page], page: Page, car: Car, url: str
-) -> None:
+def test_the_viewers_charts_are_kept_and_shared(open_page, page, car, url):
     show(page, car.send())
     titles = "Speed, Battery voltage, Current, Duty cycle, Speed and motor current, Delay of each message"
     first = titles.split(", ")
@@ -242,9 +221,7 @@ def test_the_viewers_charts_are_kept_and_shared(
     assert page.url == f"{url}#/car/car-1"
 
 
-def test_the_agents_log_lines_are_shown_and_those_of_the_last_hour(
-    open_page: Callable[..., Page], board: str, car: Car
-) -> None:
+def test_the_agents_log_lines_are_shown_and_those_of_the_last_hour(open_page, board, car):
     page = open_page(f"{board}#/car/car-1")
     line = {"level": "error", "logger": "iort_agent.sources", "text": "source vesc failed: OSError: gone"}
     show(page, car.send({**line, "left_out": 2}, stream=LOG_STREAM))
@@ -257,7 +234,7 @@ def test_the_agents_log_lines_are_shown_and_those_of_the_last_hour(
     assert page.locator(f"[data-stream={LOG_STREAM}]").count() == 0
 
 
-def test_the_trajectory_is_drawn_on_the_track(open_page: Callable[..., Page], board: str, car: Car) -> None:
+def test_the_trajectory_is_drawn_on_the_track(open_page, board, car):
     page = open_page(f"{board}#/car/car-1?charts=trajectory")
     painted = """() => {
       const canvas = document.querySelector(".panel.xy canvas");
@@ -273,7 +250,7 @@ def test_the_trajectory_is_drawn_on_the_track(open_page: Callable[..., Page], bo
     until(lambda: page.evaluate(painted) > 2 * alone, "the track")
 
 
-def test_a_chart_is_dragged_to_another_place(page: Page, car: Car) -> None:
+def test_a_chart_is_dragged_to_another_place(page, car):
     show(page, car.send(SAMPLE))
     page.get_by_label("Move Speed", exact=True).hover()
     page.mouse.down()
@@ -285,9 +262,7 @@ def test_a_chart_is_dragged_to_another_place(page: Page, car: Car) -> None:
     assert "charts=battery,speed,currents" in page.url
 
 
-def test_the_charts_keep_their_height_when_something_opens_beside_them(
-    open_page: Callable[..., Page], server: PageServer, car: Car
-) -> None:
+def test_the_charts_keep_their_height_when_something_opens_beside_them(open_page, server, car):
     page = open_page(server.invitation("#/car/car-1"))
     show(page, car.send())
     height = "() => document.querySelector('.board .charts').offsetHeight"

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -23,14 +21,7 @@ from tests.archived import FakeS3, archive, expire
 from tests.browser import plain
 from tests.unit.station.data.test_queries import START, cloud_of
 from tests.web.cars import GAIN
-from tests.web.lab import VIEWS, Lab
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from playwright.sync_api import Locator, Page
-
-    from iort_station.page.server import PageServer
+from tests.web.lab import VIEWS
 
 SECOND = 1_000_000
 FIRST_S, SECOND_S = 60, 30
@@ -40,7 +31,7 @@ FIRST = "from=2023-11-14T22:13:20.000Z&to=2023-11-14T22:14:19.981Z"
 NEWEST = "from=2023-11-14T23:13:20.000Z&to=2023-11-14T23:13:49.981Z"
 
 
-def drive(boot: str, start_us: int, seconds: int) -> Iterator[Batch]:
+def drive(boot, start_us, seconds):
     """A run of 50 samples a second, which gets faster by 0.1 m/s a second."""
     for second in range(seconds):
         times = [start_us + second * SECOND + i * 20_000 for i in range(50)]
@@ -59,63 +50,63 @@ def drive(boot: str, start_us: int, seconds: int) -> Iterator[Batch]:
 class Past:
     """A car's two runs, and the requests for its history; `expire` archives them, and deletes them."""
 
-    def __init__(self) -> None:
-        self.asked: list[dict[str, str]] = []
+    def __init__(self):
+        self.asked = []
         cloud = cloud_of(
             *drive("00000001", START, FIRST_S), *drive("00000002", LATER_US, SECOND_S), page_items=100
         )
         agent = Batch("00000001", 0, [START, START + SECOND // 2], {"cpu_percent": [3.5, 4.5]})
         self.cloud = cloud
         cloud.table.put(TELEMETRY, item_of(agent, build_topic(RECORD, "car", "agent")))
-        served = answers(cloud)  # type: ignore[arg-type]  # a fake
+        served = answers(cloud)
         self.answers = {name: served[name] for name in ("streams", "runs", "history", "vehicles")}
-        self.downloads = downloads(cloud)  # type: ignore[arg-type]  # as above
+        self.downloads = downloads(cloud)
         history = self.answers["history"]
 
-        def watched(asked: Mapping[str, str]) -> Any:
+        def watched(asked):
             self.asked.append(dict(asked))
             return history(asked)
 
         self.answers["history"] = watched
 
-    def expire(self) -> None:
+    def expire(self):
         self.cloud.bucket = FakeS3()
         archive(self.cloud.table, self.cloud.bucket)
         expire(self.cloud.table)
 
 
 @pytest.fixture
-def past() -> Past:
+def past():
     return Past()
 
 
 @pytest.fixture
-def server(serve: Callable[..., PageServer], past: Past) -> PageServer:
+def server(serve, past):
     vehicles = {"car": {"speed_to_erpm_gain": GAIN}}
     return serve(vehicles=vehicles, answers=past.answers, downloads=past.downloads)
 
 
 @pytest.fixture
-def page(open_page: Callable[..., Page], server: PageServer) -> Page:
+def page(open_page, server):
     page = open_page(f"{server.url}#/history/car", timezone_id="UTC")
     loaded(page, "1500 samples")
     return page
 
 
-def loaded(page: Page, text: str) -> None:
+def loaded(page, text):
     note = page.locator(".history-note")
     until(lambda: text in plain(note.inner_text()), f"{text}, not {note.inner_text()}")
 
 
-def address(page: Page) -> str:
+def address(page):
     return re.sub(r".*#", "#", page.url)
 
 
-def chart(page: Page, label: str) -> Locator:
+def chart(page, label):
     return page.locator(f"section.panel[aria-label='{label}'] .u-over")
 
 
-def drag(page: Page, label: str, start: float, end: float) -> None:
+def drag(page, label, start, end):
     box = chart(page, label).bounding_box()
     assert box is not None
     y = box["y"] + box["height"] / 2
@@ -125,7 +116,7 @@ def drag(page: Page, label: str, start: float, end: float) -> None:
     page.mouse.up()
 
 
-def shown(page: Page) -> list[float]:
+def shown(page):
     """The seconds of the address' range, from the start of the first run."""
     return page.evaluate(
         """(first) => {
@@ -136,7 +127,7 @@ def shown(page: Page) -> list[float]:
     )
 
 
-def test_the_history_of_an_offline_car_opens_at_its_newest_run(page: Page) -> None:
+def test_the_history_of_an_offline_car_opens_at_its_newest_run(page):
     assert address(page) == f"#/history/car?stream=vesc&{NEWEST}"
     runs = page.locator(".runs")
     about = "Runs: vesc is stored from Tue 14 Nov 22:13:20 UTC to Tue 14 Nov 23:13:49 UTC"
@@ -150,7 +141,7 @@ def test_the_history_of_an_offline_car_opens_at_its_newest_run(page: Page) -> No
     loaded(page, "Nothing was stored in this range. vesc is stored from Tue 14 Nov 22:13:20")
 
 
-def test_what_has_expired_is_shown_from_the_archive(page: Page, past: Past) -> None:
+def test_what_has_expired_is_shown_from_the_archive(page, past):
     past.expire()
     page.reload()
     loaded(page, "From the archive.")
@@ -158,9 +149,7 @@ def test_what_has_expired_is_shown_from_the_archive(page: Page, past: Past) -> N
     assert page.locator("section.panel .u-over").count() > 0
 
 
-def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(
-    page: Page, server: PageServer, past: Past, open_page: Callable[..., Page]
-) -> None:
+def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(page, server, past, open_page):
     page.goto(f"{server.url}#/history/car?{FIRST}")
     loaded(page, "averaged per 40 ms")
     drag(page, "Motor current", 0.25, 0.5)
@@ -187,7 +176,7 @@ def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(
     until(lambda: int(past.asked[-1]["from_us"]) > START + 14 * SECOND, "its data")
 
 
-def test_the_wheel_pans_a_zoomed_chart_and_scrolls_the_page_otherwise(page: Page) -> None:
+def test_the_wheel_pans_a_zoomed_chart_and_scrolls_the_page_otherwise(page):
     page.set_viewport_size({"width": 1280, "height": 500})
     drag(page, "Speed", 0.4, 0.6)
     until(lambda: shown(page)[1] - shown(page)[0] < 10, "the zoom")
@@ -209,7 +198,7 @@ def test_the_wheel_pans_a_zoomed_chart_and_scrolls_the_page_otherwise(page: Page
     assert address(page).endswith(NEWEST)
 
 
-def test_two_fingers_pan_and_pinch(open_page: Callable[..., Page], server: PageServer) -> None:
+def test_two_fingers_pan_and_pinch(open_page, server):
     phone = {"has_touch": True, "is_mobile": True, "viewport": {"width": 390, "height": 844}}
     page = open_page(f"{server.url}#/history/car?{FIRST}", timezone_id="UTC", **phone)
     loaded(page, "3000 samples")
@@ -219,7 +208,7 @@ def test_two_fingers_pan_and_pinch(open_page: Callable[..., Page], server: PageS
     assert box is not None
     touch = page.context.new_cdp_session(page)
 
-    def fingers(kind: str, *shares: float) -> None:
+    def fingers(kind, *shares):
         y = box["y"] + box["height"] / 2
         points = [{"x": box["x"] + box["width"] * share, "y": y, "id": i} for i, share in enumerate(shares)]
         touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
@@ -238,7 +227,7 @@ def test_two_fingers_pan_and_pinch(open_page: Callable[..., Page], server: PageS
     assert value.evaluate("(td) => td.scrollWidth <= td.clientWidth")
 
 
-def test_the_playback_is_as_fast_as_chosen(page: Page) -> None:
+def test_the_playback_is_as_fast_as_chosen(page):
     page.get_by_label("Speed of the playback").select_option("16")
     scrub = page.locator(".scrub")
     scrub.focus()
@@ -250,7 +239,7 @@ def test_the_playback_is_as_fast_as_chosen(page: Page) -> None:
     assert page.get_by_role("button", name="Play").is_visible()
 
 
-def test_the_range_is_saved_as_csv_parquet_and_mcap(page: Page, server: PageServer) -> None:
+def test_the_range_is_saved_as_csv_parquet_and_mcap(page, server):
     # 50 samples: both ends are whole milliseconds.
     link = f"{server.url}#/history/car?from=2023-11-14T23:13:30.000Z&to=2023-11-14T23:13:31.000Z"
     page.goto(link)
@@ -272,9 +261,7 @@ def test_the_range_is_saved_as_csv_parquet_and_mcap(page: Page, server: PageServ
         ]
 
 
-def test_a_download_says_what_is_wrong_before_it_sends_anything(
-    page: Page, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_download_says_what_is_wrong_before_it_sends_anything(page, monkeypatch):
     monkeypatch.setattr("iort_station.page.history.MOST_VALUES", 1000)
     monkeypatch.setattr("iort_station.page.history.MOST_BYTES", 1000)
     note = page.locator(".download .note")
@@ -284,7 +271,7 @@ def test_a_download_says_what_is_wrong_before_it_sends_anything(
     until(lambda: "over 1,000 bytes: choose a shorter one" in note.inner_text(), "the other reason")
 
 
-def test_another_stream_is_loaded_at_once_and_kept_in_the_address(page: Page, past: Past) -> None:
+def test_another_stream_is_loaded_at_once_and_kept_in_the_address(page, past):
     page.locator("#stream").select_option("agent")
     loaded(page, "Nothing was stored in this range.")
     page.reload()
@@ -293,10 +280,10 @@ def test_another_stream_is_loaded_at_once_and_kept_in_the_address(page: Page, pa
     assert "?stream=agent&from=" in page.url
 
 
-def middle(page: Page, at: float, unit: str) -> list[float]:
+def middle(page, at, unit):
     """Both cars' speeds in the middle of the chart, which is at ``at``."""
 
-    def there() -> bool:
+    def there():
         box = chart(page, "Speed").bounding_box()
         assert box is not None
         page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -308,7 +295,7 @@ def middle(page: Page, at: float, unit: str) -> list[float]:
     return [float(text) for text in texts]
 
 
-def test_runs_are_compared_over_time_and_distance(page: Page, server: PageServer, past: Past) -> None:
+def test_runs_are_compared_over_time_and_distance(page, server, past):
     page.locator(".runs summary").click()
     for box in page.locator(".runs input").all():
         box.check()
@@ -342,12 +329,12 @@ def test_runs_are_compared_over_time_and_distance(page: Page, server: PageServer
 
 
 @pytest.fixture
-def any_past(serve: Callable[..., PageServer], lab: Lab) -> str:
+def any_past(serve, lab):
     """A lab's page, whose cars have a past."""
     return serve(**lab.served()).url
 
 
-def test_times_are_typed_with_24_hours(open_page: Callable[..., Page], any_past: str) -> None:
+def test_times_are_typed_with_24_hours(open_page, any_past):
     page = open_page(any_past + VIEWS["history"].address, timezone_id="UTC", locale="en-US")
     page.locator(VIEWS["history"].filled).first.wait_for()
     page.fill("#from", "2026-05-04 14:00:00")
@@ -359,14 +346,14 @@ def test_times_are_typed_with_24_hours(open_page: Callable[..., Page], any_past:
     until(lambda: "from=2026-05-04T14:00:00.000Z&to=2026-05-04T15:00:00.000Z" in page.url, "the range")
 
 
-def test_the_lines_of_a_comparison_have_names(open_page: Callable[..., Page], any_past: str) -> None:
+def test_the_lines_of_a_comparison_have_names(open_page, any_past):
     page = open_page(any_past + VIEWS["compare"].address, timezone_id="UTC")
     page.locator(VIEWS["compare"].filled).first.wait_for()
     legend = page.locator(".compare-view .charts .panel").first.locator(".reading .label")
     assert legend.all_inner_texts() == ["10:00:00 UTC", "11:00:00 UTC"]
 
 
-def test_what_an_address_says_in_vain_is_told(open_page: Callable[..., Page], any_past: str) -> None:
+def test_what_an_address_says_in_vain_is_told(open_page, any_past):
     page = open_page(any_past)
     wrong = "#/history/car-1?from=2026-05-04T10:00:00Z&to=2026-05-04T09:00:00Z"
     for address, reasons in {

@@ -5,26 +5,16 @@ from __future__ import annotations
 import math
 import socket
 import time
-from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from iort_contract.catalog.vesc import TEMPERATURES
-from iort_contract.limits import Value
 from testkit.waiting import until
 from tests.browser import drawn, plain, show, shown
 from tests.web.cars import GAIN, SAMPLE, Car
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
-    from playwright.sync_api import Page
-
-    from iort_station.page.server import PageServer
-    from local.pubnub import PubNubStandIn
-
-
-def test_the_empty_page_says_that_it_waits_for_a_car(page: Page, pubnub: PubNubStandIn) -> None:
+def test_the_empty_page_says_that_it_waits_for_a_car(page, pubnub):
     text = page.inner_text("#empty")
     assert "Waiting for car-1" in text
     assert "iort.*" in text
@@ -32,7 +22,7 @@ def test_the_empty_page_says_that_it_waits_for_a_car(page: Page, pubnub: PubNubS
     assert page.inner_text("#link") == "Connected"
 
 
-def test_the_page_shows_the_sent_values(page: Page, car: Car) -> None:
+def test_the_page_shows_the_sent_values(page, car):
     update = car.send()
     show(page, update)
     assert page.evaluate("iort.robots['car-1'].streams.vesc.sample") == update["sample"]
@@ -59,7 +49,7 @@ def test_the_page_shows_the_sent_values(page: Page, car: Car) -> None:
         assert plain(page.inner_text(f"[data-reading='{name}']")) == text
 
 
-def test_the_hottest_value_covers_every_temperature_of_the_alarm(page: Page, car: Car) -> None:
+def test_the_hottest_value_covers_every_temperature_of_the_alarm(page, car):
     for hot in TEMPERATURES:
         show(page, car.send({**dict.fromkeys(TEMPERATURES, 0), "temperature_pcb": -4.5, hot: 81.5}))
         assert shown(page, "temperature") == "81.5"
@@ -67,7 +57,7 @@ def test_the_hottest_value_covers_every_temperature_of_the_alarm(page: Page, car
     assert shown(page, "temperature") == "-4.5"
 
 
-def test_charge_and_energy_have_the_unit_of_their_driver(page: Page, car: Car) -> None:
+def test_charge_and_energy_have_the_unit_of_their_driver(page, car):
     show(page, car.send({**SAMPLE, "charge_drawn": 0, "energy_drawn": 0}))
     page.click("[data-stream='vesc'] .tile:has([data-value='charge_drawn'])")
     show(page, car.send({**SAMPLE, "charge_drawn": 0.0019, "energy_drawn": 1}))
@@ -76,7 +66,7 @@ def test_charge_and_energy_have_the_unit_of_their_driver(page: Page, car: Car) -
     assert plain(page.inner_text("[data-reading='vesc/charge_drawn']")) == "0.0019"
 
 
-def test_every_newer_message_is_shown(page: Page, car: Car) -> None:
+def test_every_newer_message_is_shown(page, car):
     for i in range(30):
         update = car.send({**SAMPLE, "voltage_input": 10 + i / 20})
     show(page, update)
@@ -85,17 +75,17 @@ def test_every_newer_message_is_shown(page: Page, car: Car) -> None:
     assert page.evaluate("iort.outOfOrder") == 0
 
 
-def test_the_page_shows_any_field_of_any_stream(page: Page, car: Car) -> None:
-    sample: dict[str, Value] = {"pose.x": -1.25, "armed": True, "frame": "map", "nothing": None, "n": 1234567}
+def test_the_page_shows_any_field_of_any_stream(page, car):
+    sample = {"pose.x": -1.25, "armed": True, "frame": "map", "nothing": None, "n": 1234567}
     show(page, car.send(sample, stream="odom"))
     texts = {name: shown(page, name) for name in sample}
     assert texts == {"pose.x": "-1.25", "armed": "true", "frame": "map", "nothing": "\u2013", "n": "1234567"}
     assert not page.locator("section[aria-label='Battery voltage']").is_visible()
 
 
-def test_text_from_a_robot_is_never_html(page: Page, car: Car, url: str) -> None:
+def test_text_from_a_robot_is_never_html(page, car, url):
     text = '<img src=x onerror="window.hacked=1"><script>window.hacked=1</script>'
-    hostile: dict[str, Value] = {"frame": text, "fault_code": text, "constructor": 1, "toString": "x"}
+    hostile = {"frame": text, "fault_code": text, "constructor": 1, "toString": "x"}
     show(page, car.send(hostile, stream="odom"))
     assert shown(page, "frame") == text
     assert shown(page, "constructor") == "1"
@@ -107,7 +97,7 @@ def test_text_from_a_robot_is_never_html(page: Page, car: Car, url: str) -> None
     assert page.evaluate("window.hacked") is None
 
 
-def test_a_foreign_script_does_not_run(page: Page, open_page: Any) -> None:
+def test_a_foreign_script_does_not_run(page, open_page):
     page.evaluate(
         """() => {
           const script = document.createElement("script");
@@ -122,7 +112,7 @@ def test_a_foreign_script_does_not_run(page: Page, open_page: Any) -> None:
     open_page.errors.clear()
 
 
-def test_the_delay_equals_the_delay_measured_outside(page: Page, car: Car) -> None:
+def test_the_delay_equals_the_delay_measured_outside(page, car):
     bounds = []
     for _ in range(12):
         update = car.update()
@@ -148,7 +138,7 @@ def test_the_delay_equals_the_delay_measured_outside(page: Page, car: Car) -> No
     until(lambda: page.locator("[data-value=leg_car]").inner_text() == "2.0", "the delay by hop")
 
 
-def test_the_delay_uses_the_clouds_clock(page: Page, car: Car) -> None:
+def test_the_delay_uses_the_clouds_clock(page, car):
     update = car.update()
     hour_us = 3_600_000_000
     for hop, key in ((update, "t"), (update["hops"], "sent_us")):
@@ -165,7 +155,7 @@ def test_the_delay_uses_the_clouds_clock(page: Page, car: Car) -> None:
     until(lambda: "corrected by the offset" in page.inner_text(".warning"), "the warning about the offset")
 
 
-def test_a_message_out_of_order_is_not_the_newest(page: Page, car: Car) -> None:
+def test_a_message_out_of_order_is_not_the_newest(page, car):
     first = car.update({**SAMPLE, "voltage_input": 1})
     second = car.send({**SAMPLE, "voltage_input": 2})
     show(page, second)
@@ -182,9 +172,9 @@ def test_a_message_out_of_order_is_not_the_newest(page: Page, car: Car) -> None:
     assert shown(page, "voltage_input") == "3.00"
 
 
-def test_malformed_messages_are_counted_and_ignored(page: Page, car: Car) -> None:
+def test_malformed_messages_are_counted_and_ignored(page, car):
     good = car.update()
-    bad: list[Any] = [
+    bad = [
         7,
         "text",
         [],
@@ -218,7 +208,7 @@ def test_malformed_messages_are_counted_and_ignored(page: Page, car: Car) -> Non
     assert shown(page, "voltage_input") == "11.65"
 
 
-def test_a_fault_is_highlighted_by_name_and_logged(page: Page, car: Car, url: str) -> None:
+def test_a_fault_is_highlighted_by_name_and_logged(page, car, url):
     rows = page.locator(".faults tbody tr[data-state]:not([data-state=none])")
     show(page, car.send({**SAMPLE, "fault_code": 5}))
     assert page.inner_text(".fault") == "Fault: MOSFET over-temperature (5)"
@@ -237,7 +227,7 @@ def test_a_fault_is_highlighted_by_name_and_logged(page: Page, car: Car, url: st
     assert "unknown fault (99)" in card.inner_text()
 
 
-def test_old_values_look_stale_and_a_silent_car_disappears(page: Page, car: Car) -> None:
+def test_old_values_look_stale_and_a_silent_car_disappears(page, car):
     show(page, car.send())
     # The values shown before, and how long the car had been silent then.
     page.evaluate(
@@ -262,17 +252,17 @@ def test_old_values_look_stale_and_a_silent_car_disappears(page: Page, car: Car)
     sends_until_live(page, car)
 
 
-def sends_until_live(page: Page, car: Car) -> None:
+def sends_until_live(page, car):
     """The car sends, until one of its messages is shown in time."""
 
-    def live() -> bool:
+    def live():
         show(page, car.send())
         return page.get_attribute("#car", "data-state") == "live"
 
     until(live, "the car to be live")
 
 
-def test_a_sample_with_a_long_delay_is_stale(page: Page, car: Car) -> None:
+def test_a_sample_with_a_long_delay_is_stale(page, car):
     first = car.send()
     show(page, first)
     until(lambda: page.evaluate("iort.robots['car-1'].state") == "stale", "silence")
@@ -285,7 +275,7 @@ def test_a_sample_with_a_long_delay_is_stale(page: Page, car: Car) -> None:
     sends_until_live(page, car)
 
 
-def test_the_page_reconnects_and_reports_it(page: Page, car: Car) -> None:
+def test_the_page_reconnects_and_reports_it(page, car):
     show(page, car.send())
     car.pubnub.stop()
     until(lambda: page.inner_text("#link") == "Connection lost", "the page to notice")
@@ -297,9 +287,7 @@ def test_the_page_reconnects_and_reports_it(page: Page, car: Car) -> None:
     assert shown(page, "voltage_input") == "12.00"
 
 
-def test_the_page_detects_a_hanging_pubnub(
-    open_page: Callable[..., Page], serve: Callable[..., PageServer]
-) -> None:
+def test_the_page_detects_a_hanging_pubnub(open_page, serve):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         server = serve(origin=f"127.0.0.1:{silent.getsockname()[1]}")
         page = open_page(server.url, listening=False)
@@ -307,7 +295,7 @@ def test_the_page_detects_a_hanging_pubnub(
         until(lambda: "does not answer" in page.inner_text("#banner"), "the reason")
 
 
-def test_any_number_can_be_charted(page: Page, car: Car) -> None:
+def test_any_number_can_be_charted(page, car):
     show(page, car.send())
     tile = page.locator("button.tile", has_text="Displacement")
     tile.click()
@@ -319,7 +307,7 @@ def test_any_number_can_be_charted(page: Page, car: Car) -> None:
     assert panel.count() == 0
 
 
-def test_xy_charts_appear_with_their_data(page: Page, car: Car) -> None:
+def test_xy_charts_appear_with_their_data(page, car):
     plane = page.locator("section.panel[aria-label=Trajectory]")
     show(page, car.send())
     assert page.locator("section.panel[aria-label='Speed and motor current']").is_visible()
@@ -330,7 +318,7 @@ def test_xy_charts_appear_with_their_data(page: Page, car: Car) -> None:
     assert page.locator("section.panel[aria-label='Accelerations, G-G']").is_visible()
 
 
-def test_updates_do_not_move_the_layout(page: Page, car: Car) -> None:
+def test_updates_do_not_move_the_layout(page, car):
     show(page, car.send())
     page.evaluate(
         """() => {
@@ -349,7 +337,7 @@ def test_updates_do_not_move_the_layout(page: Page, car: Car) -> None:
     assert max((value for value, _ in shifts), default=0) < 0.02, "\n".join(map(str, shifts))
 
 
-def test_memory_stays_bounded(page: Page, car: Car, url: str) -> None:
+def test_memory_stays_bounded(page, car, url):
     page.goto(f"{url}#/")
     bounds = page.evaluate("iort.bounds")
     many = {f"f{i}": i for i in range(500)}
@@ -364,7 +352,7 @@ def test_memory_stays_bounded(page: Page, car: Car, url: str) -> None:
     assert update["stream"] not in page.evaluate("Object.keys(iort.robots['car-1'].streams)")
 
 
-def test_a_phone_needs_no_sideways_scrolling(open_page: Callable[..., Page], url: str, car: Car) -> None:
+def test_a_phone_needs_no_sideways_scrolling(open_page, url, car):
     page = open_page(url, viewport={"width": 375, "height": 700}, has_touch=True)
     for name in ("car-1", "a-car-with-a-name-as-long-as-names-may-be-" + "x" * 21):
         car = Car(car.pubnub, name)
@@ -378,7 +366,7 @@ def test_a_phone_needs_no_sideways_scrolling(open_page: Callable[..., Page], url
         assert page.evaluate("document.documentElement.scrollWidth") == 375
 
 
-def test_the_test_interface_is_read_only(page: Page, car: Car) -> None:
+def test_the_test_interface_is_read_only(page, car):
     show(page, car.send())
     change = "iort.robots['car-1'].streams.vesc.sample.speed = 1; iort.received = 9"
     page.evaluate(f"() => {{ try {{ {change} }} catch {{}} }}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -17,19 +16,11 @@ from tests.images import jpeg
 from tests.web.cars import SAMPLE, Car
 from tests.web.lab import VIEWS, past
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from playwright.sync_api import Page
-
-    from iort_contract.messages.page import HistoryAnswer
-    from iort_station.page.server import PageServer
-
 KEY = "robots/car-1/2026/05/04/100000-0123456789abcdef/camera/1-data.jpg"
 STREAM = "camera"
 
 
-def with_attachment(picture: str | None, **change: Any) -> dict[str, Any]:
+def with_attachment(picture, **change):
     """Make a sample with an attachment on its field ``data``."""
     claim = {
         "key": KEY,
@@ -44,14 +35,14 @@ def with_attachment(picture: str | None, **change: Any) -> dict[str, Any]:
 LEFT_OUT = with_attachment(None, key=None, sha256=None, size=None, content_type=None)
 
 
-def plain_jpeg(colour: tuple[int, int, int], size: tuple[int, int] = (96, 54)) -> str:
+def plain_jpeg(colour, size=(96, 54)):
     Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")  # noqa: N806 - a module
     out = io.BytesIO()
     Image.new("RGB", size, colour).save(out, "JPEG", quality=90)
     return base64.b64encode(out.getvalue()).decode()
 
 
-def middle(page: Page) -> list[int]:
+def middle(page):
     """Return red, green and blue in the middle of the picture."""
     script = """() => {
       const canvas = document.querySelector("[data-picture=data] canvas");
@@ -61,14 +52,14 @@ def middle(page: Page) -> list[int]:
     return list(page.evaluate(script))
 
 
-def is_drawn(page: Page, colour: tuple[int, int, int]) -> None:
-    def near() -> bool:
+def is_drawn(page, colour):
+    def near():
         return all(abs(a - b) < 12 for a, b in zip(middle(page), colour, strict=True))
 
     until(near, f"a picture of {colour}")
 
 
-def test_a_cameras_thumbnail_is_drawn_and_stays_while_others_are_left_out(page: Page, car: Car) -> None:
+def test_a_cameras_thumbnail_is_drawn_and_stays_while_others_are_left_out(page, car):
     show(page, car.send(LEFT_OUT, stream=STREAM))
     tile = page.locator("[data-picture=data]")
     assert "no picture yet" in tile.inner_text()
@@ -88,7 +79,7 @@ def test_a_cameras_thumbnail_is_drawn_and_stays_while_others_are_left_out(page: 
     is_drawn(page, (20, 160, 40))
 
 
-def test_the_page_draws_the_agents_thumbnails(page: Page, car: Car) -> None:
+def test_the_page_draws_the_agents_thumbnails(page, car):
     made = thumbnail(jpeg(1), "image/jpeg")
     assert made is not None
     show(page, car.send(with_attachment(made), stream=STREAM))
@@ -97,7 +88,7 @@ def test_the_page_draws_the_agents_thumbnails(page: Page, car: Car) -> None:
     assert page.evaluate("(c) => [c.width, c.height]", canvas.element_handle()) == [96, 72]
 
 
-def hostile_texts() -> dict[str, str]:
+def hostile_texts():
     """Return texts that are not our thumbnails; the last two declare a size above the limit."""
     small = bytearray(base64.b64decode(plain_jpeg((0, 0, 0))))
     at = small.index(b"\xff\xc0")
@@ -118,7 +109,7 @@ def hostile_texts() -> dict[str, str]:
     }
 
 
-def test_an_invalid_picture_is_reported(page: Page, car: Car) -> None:
+def test_an_invalid_picture_is_reported(page, car):
     tile = page.locator("[data-picture=data]")
     for what, text in hostile_texts().items():
         show(page, car.send(with_attachment(plain_jpeg((10, 10, 200))), stream=STREAM))
@@ -132,20 +123,18 @@ def test_an_invalid_picture_is_reported(page: Page, car: Car) -> None:
     until(lambda: "no picture" in tile.inner_text(), "the notice of an invalid picture")
 
 
-def test_a_field_named_like_an_attachment_is_shown_unchanged(page: Page, car: Car) -> None:
+def test_a_field_named_like_an_attachment_is_shown_unchanged(page, car):
     show(page, car.send({**SAMPLE, "data.thumbnail": "text", "data.key": "k"}))
     assert page.locator("[data-picture]").count() == 0
     assert page.locator("[data-value='data.thumbnail']").inner_text() == "text"
 
 
-def test_the_history_shows_the_picture_of_the_selected_time(
-    open_page: Callable[..., Page], serve: Callable[..., PageServer]
-) -> None:
+def test_the_history_shows_the_picture_of_the_selected_time(open_page, serve):
     red, green = plain_jpeg((200, 30, 30)), plain_jpeg((20, 160, 40))
     rows = [with_attachment(red), LEFT_OUT, LEFT_OUT, with_attachment(green), LEFT_OUT]
     fields = {name: [row[name] for row in rows] for name in rows[0]}
 
-    def history(asked: Any) -> HistoryAnswer:
+    def history(asked):
         return past([int(asked["from_us"]) / 1e6 + 0.5 * i for i in range(len(rows))], fields)
 
     server = serve(answers={"streams": lambda _: {"streams": [STREAM]}, "history": history})
@@ -169,7 +158,7 @@ AXE = Path(__file__).parents[3] / "node_modules" / "axe-core" / "axe.min.js"
 DESKTOP = {"viewport": {"width": 1280, "height": 900}}
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 FAULTY = {**SAMPLE, "fault_code": 2}
-LOGGED: dict[str, Any] = {
+LOGGED = {
     "level": "error",
     "logger": "iort_agent",
     "text": "failed\nwith details",
@@ -187,7 +176,7 @@ SMALL = """(least) => [...document.querySelectorAll("a, button, input, select, s
 BEYOND = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 
 
-def violations(page: Page) -> list[str]:
+def violations(page):
     """What axe finds with everything unfolded: the rule, the place and the reason."""
     page.evaluate("() => document.querySelectorAll('details').forEach((each) => { each.open = true; })")
     drawn(page)
@@ -201,7 +190,7 @@ def violations(page: Page) -> list[str]:
     ]
 
 
-def silent(page: Page, car: Car, state: str) -> int:
+def silent(page, car, state):
     """Whether a car that has sent is stale or gone; on a slow machine a car that is gone sends again."""
     if state == "stale" and page.locator("[data-state=gone]").count():
         show(page, car.send(FAULTY))
@@ -209,9 +198,7 @@ def silent(page: Page, car: Car, state: str) -> int:
 
 
 @pytest.mark.parametrize(("device", "theme"), [(DESKTOP, "dark"), (PHONE, "light")], ids=["desktop", "phone"])
-def test_every_view_is_accessible(
-    open_page: Callable[..., Page], server: PageServer, car: Car, device: dict[str, Any], theme: str
-) -> None:
+def test_every_view_is_accessible(open_page, server, car, device, theme):
     faults = {}
     page = open_page(server.invitation(), color_scheme=theme, reduced_motion="reduce", **device)
     page.evaluate(AXE.read_text())
@@ -240,7 +227,7 @@ def test_every_view_is_accessible(
     assert {view: found for view, found in faults.items() if found} == {}
 
 
-def test_a_card_outside_the_screen_has_a_name(page: Page, car: Car, url: str) -> None:
+def test_a_card_outside_the_screen_has_a_name(page, car, url):
     page.goto(f"{url}#/")
     names = [f"car-{i}" for i in range(40)]
     for name in names:
@@ -252,7 +239,7 @@ def test_a_card_outside_the_screen_has_a_name(page: Page, car: Car, url: str) ->
     assert "" not in links
 
 
-def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(page: Page, car: Car) -> None:
+def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(page, car):
     for volts in (11.0, 12.5, 11.75):
         show(page, car.send({**SAMPLE, "voltage_input": volts}))
     chart = page.locator("[role=img][aria-label^='Chart Battery voltage']")
@@ -263,7 +250,7 @@ def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(page: Page, ca
     page.keyboard.press("ArrowLeft")
     until(lambda: spoken.inner_text().endswith(" s ago: 11.75 V"), "the newest value")
 
-    def at(keys: str, volts: str) -> bool:
+    def at(keys, volts):
         # The chart moves on below a cursor that stays.
         for key in keys.split():
             page.keyboard.press(key)
@@ -277,9 +264,7 @@ def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(page: Page, ca
     assert page.url.endswith("#/car/car-1")
 
 
-def test_a_chart_of_the_past_is_told_in_words_and_has_a_cursor_for_arrow_keys(
-    open_page: Callable[..., Page], server: PageServer
-) -> None:
+def test_a_chart_of_the_past_is_told_in_words_and_has_a_cursor_for_arrow_keys(open_page, server):
     page = open_page(server.url + VIEWS["history"].address)
     chart = page.locator("[role=img][aria-label^='Chart Battery voltage']")
     extent = f"minimum -{SAMPLE['voltage_input']} V, maximum {SAMPLE['voltage_input']} V"

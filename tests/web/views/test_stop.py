@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -11,14 +10,6 @@ from testkit.waiting import GUARD_S, until
 from tests.browser import show
 from tests.web.cars import Car
 from tests.web.lab import WHY_NOT, Lab, history
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from playwright.sync_api import Page
-
-    from iort_station.page.server import PageServer
-    from local.pubnub import PubNubStandIn
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 _RANGES = [f"car-1/2026-05-04T1{i}:00:00.000Z/2026-05-04T1{i}:01:00.000Z" for i in range(6)]
@@ -28,30 +19,30 @@ COMPARE = f"#/compare?runs={','.join(_RANGES)}"
 class Held(Lab):
     """A lab that holds its history, and its stops, until they are let go."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.past, self.stops = threading.Event(), threading.Event()
         self.stops.set()
         # Requests for the history that are held.
         self.reading = 0
-        self.pressed: list[Mapping[str, str]] = []
+        self.pressed = []
 
-    def stop(self, asked: Mapping[str, str]) -> dict[str, Any]:
+    def stop(self, asked):
         self.pressed.append(asked)
         assert self.stops.wait(GUARD_S)
         return super().stop(asked)
 
-    def answers(self) -> dict[str, Any]:
+    def answers(self):
         return {**super().answers(), "history": self._history}
 
-    def _history(self, asked: Mapping[str, str]) -> Any:
+    def _history(self, asked):
         self.reading += 1
         assert self.past.wait(GUARD_S)
         return history(asked)
 
 
 @pytest.fixture
-def lab() -> Iterator[Held]:
+def lab():
     lab = Held()
     yield lab
     lab.past.set()
@@ -59,9 +50,7 @@ def lab() -> Iterator[Held]:
 
 
 @pytest.mark.parametrize("tabs", [1, 3])
-def test_a_stop_passes_every_answer_that_the_tabs_of_a_browser_wait_for(
-    open_page: Callable[..., Page], lab: Held, server: PageServer, tabs: int
-) -> None:
+def test_a_stop_passes_every_answer_that_the_tabs_of_a_browser_wait_for(open_page, lab, server, tabs):
     page = open_page(server.invitation())
     for _ in range(tabs - 1):
         page.context.new_page().goto(server.url + COMPARE)
@@ -78,9 +67,7 @@ def test_a_stop_passes_every_answer_that_the_tabs_of_a_browser_wait_for(
     page.locator(".compare-view .charts canvas").first.wait_for()
 
 
-def test_a_press_is_shown_at_once_and_what_to_do_without_an_answer(
-    open_page: Callable[..., Page], lab: Held, server: PageServer, car: Car
-) -> None:
+def test_a_press_is_shown_at_once_and_what_to_do_without_an_answer(open_page, lab, server, car):
     page = open_page(server.invitation("#/car/car-1"))
     show(page, car.send())
     page.get_by_role("button", name="Take the wheel").wait_for()
@@ -104,9 +91,7 @@ def test_a_press_is_shown_at_once_and_what_to_do_without_an_answer(
     assert not sent.is_visible()
 
 
-def test_a_server_that_is_gone_has_stopped_nothing(
-    open_page: Callable[..., Page], server: PageServer
-) -> None:
+def test_a_server_that_is_gone_has_stopped_nothing(open_page, server):
     page = open_page(server.invitation())
     page.locator(".stop-press").wait_for()
     server.stop()
@@ -117,9 +102,7 @@ def test_a_server_that_is_gone_has_stopped_nothing(
     said.filter(has_text="use the switch on the car").wait_for()
 
 
-def test_a_car_that_does_not_stand_is_named_before_and_after_a_stop(
-    open_page: Callable[..., Page], lab: Held, server: PageServer, pubnub: PubNubStandIn
-) -> None:
+def test_a_car_that_does_not_stand_is_named_before_and_after_a_stop(open_page, lab, server, pubnub):
     lab.unstoppable.add("car-9")
     page = open_page(server.invitation())
     for name in ("car-1", "car-9"):
@@ -152,9 +135,7 @@ def test_a_car_that_does_not_stand_is_named_before_and_after_a_stop(
 
 
 @pytest.mark.parametrize("options", [{}, PHONE], ids=["desktop", "phone"])
-def test_the_stop_its_words_and_the_speed_stay_in_sight(
-    open_page: Callable[..., Page], server: PageServer, car: Car, options: dict[str, Any]
-) -> None:
+def test_the_stop_its_words_and_the_speed_stay_in_sight(open_page, server, car, options):
     page = open_page(server.invitation("#/car/car-1"), **options)
     show(page, car.send())
     page.get_by_role("button", name="Stop car-1").click()
@@ -165,5 +146,5 @@ def test_the_stop_its_words_and_the_speed_stay_in_sight(
         box = page.locator(place).bounding_box()
         assert box
         assert box["y"] >= 0, place
-        assert box["y"] + box["height"] <= page.viewport_size["height"], place  # type: ignore[index]  # it has one
+        assert box["y"] + box["height"] <= page.viewport_size["height"], place
     assert "m/s" in page.inner_text("#speed-now")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from itertools import product
-from typing import TYPE_CHECKING, Any
 
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -14,17 +13,10 @@ from tests.browser import drawn, plain, show, shown
 from tests.web.cars import GAIN, SAMPLE, Car
 from tests.web.lab import VIEWS, past
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from playwright.sync_api import Page
-
-    from iort_station.page.server import PageServer
-
 OFFSET_ERPM = 461.4
 VEHICLE = {"speed_to_erpm_gain": GAIN, "speed_to_erpm_offset": OFFSET_ERPM}
 SPEED_ERPM = (9228.0 + OFFSET_ERPM, 4614.0 + OFFSET_ERPM)
-ANSWERS: dict[str, Any] = {
+ANSWERS = {
     "streams": lambda _: {"streams": [VESC_STREAM]},
     "history": lambda asked: past(
         [int(asked["from_us"]) / 1e6 + second for second in (0, 1)],
@@ -33,9 +25,7 @@ ANSWERS: dict[str, Any] = {
 }
 
 
-def test_the_speed_uses_the_cars_gain_and_offset(
-    open_page: Callable[..., Page], serve: Callable[..., PageServer], car: Car
-) -> None:
+def test_the_speed_uses_the_cars_gain_and_offset(open_page, serve, car):
     server = serve(vehicles={"car-1": VEHICLE}, answers=ANSWERS)
     page = open_page(f"{server.url}#/car/car-1")
     show(page, car.send({**SAMPLE, "speed": SPEED_ERPM[0]}))
@@ -53,9 +43,7 @@ def test_the_speed_uses_the_cars_gain_and_offset(
     assert panel.locator(".unit").inner_text() == "m/s"
 
 
-def test_an_unknown_car_shows_its_motor_speed(
-    open_page: Callable[..., Page], serve: Callable[..., PageServer], car: Car
-) -> None:
+def test_an_unknown_car_shows_its_motor_speed(open_page, serve, car):
     server = serve(answers=ANSWERS)
     page = open_page(f"{server.url}#/history/car-1")
     row = page.locator("tr[data-field=speed]")
@@ -66,9 +54,7 @@ def test_an_unknown_car_shows_its_motor_speed(
     assert page.locator(".gauge", has_text="Speed").locator(".gauge-value .unit").inner_text() == "erpm"
 
 
-def test_every_view_tells_the_zone_of_its_times(
-    open_page: Callable[..., Page], server: PageServer, car: Car
-) -> None:
+def test_every_view_tells_the_zone_of_its_times(open_page, server, car):
     page = open_page(server.invitation(), timezone_id="Asia/Kolkata", locale="de-DE")
     line = {"level": "error", "logger": "iort_agent", "text": "failed", "left_out": 0}
     for view, (address, filled) in VIEWS.items():
@@ -84,14 +70,14 @@ def test_every_view_tells_the_zone_of_its_times(
         assert re.findall(r"\d\d:\d\d:\d\d(?!.{0,24}GMT\+5:30)", told) == [], view
 
 
-def test_ros_standard_messages_have_their_units(page: Page, car: Car) -> None:
+def test_ros_standard_messages_have_their_units(page, car):
     sample = {"linear_acceleration.x": 1.5, "twist.twist.angular.z": -0.25, "position.y": 2, "position.w": 3}
     show(page, car.send(sample, stream="odom"))
     tiles = page.locator("[data-stream=odom] .tile-value").all_inner_texts()
     assert [plain(text).replace("\n", " ") for text in tiles] == ["1.50m/s²", "-0.25rad/s", "2.00m", "3"]
 
 
-def test_the_page_counts_faulty_cars(page: Page, car: Car) -> None:
+def test_the_page_counts_faulty_cars(page, car):
     cars = [Car(car.pubnub, name) for name in ("a", "b", "c")]
     for each, code in zip(cars, (5, 0, 3), strict=True):
         show(page, each.send({**SAMPLE, "fault_code": code}))
@@ -103,19 +89,19 @@ def test_the_page_counts_faulty_cars(page: Page, car: Car) -> None:
     until(lambda: page.inner_text("#faulty") == "", "none")
 
 
-def luminance(colour: str) -> float:
+def luminance(colour):
     """Relative luminance, WCAG 2.2."""
     parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     red, green, blue = (p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-def contrast(one: str, other: str) -> float:
+def contrast(one, other):
     low, high = sorted((luminance(one), luminance(other)))
     return (high + 0.05) / (low + 0.05)
 
 
-def test_text_and_lines_have_enough_contrast_in_both_themes() -> None:
+def test_text_and_lines_have_enough_contrast_in_both_themes():
     style = (ROOT / "station" / "web" / "style" / "theme.css").read_text()
     pairs = re.findall(r"--([a-z0-9-]+): light-dark\((#\w{6}), (#\w{6})\)", style)
     colours = {name: (light, dark) for name, light, dark in pairs}
