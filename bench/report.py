@@ -48,6 +48,13 @@ class Ratio:
         reached = "" if self.reached is None else "yes" if self.reached else "**no**"
         return [self.name, f"{self.value:g}{unit}", target, reached]
 
+    @property
+    def of_target(self) -> float | None:
+        """The figure as a part of its target, below 1 if reached; None without a target other than 0."""
+        if not self.target or not self.value:
+            return None
+        return self.target / self.value if self.at_least else self.value / self.target
+
 
 @dataclass
 class Section:
@@ -110,6 +117,27 @@ BENCH = Report("report", "The measured platform", "make bench")
 ANALYSIS = Report("analysis", "The proof of the analysis", "make bench ONLY=analysis", merged=True)
 
 
+def draw(sections: Sequence[Section], path: Path) -> None:
+    """Draw every figure beside its target, which is the line at 1, as a picture."""
+    import matplotlib as mpl  # noqa: PLC0415 - `make bench --help` and the guard draw nothing
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    ratios = [(part, entry) for section in sections for entry in section.ratios if (part := entry.of_target)]
+    with mpl.rc_context({"svg.hashsalt": "iort", "svg.fonttype": "none", "font.size": 9}):
+        figure = Figure((9, 1 + 0.22 * len(ratios)), layout="constrained")
+        axes = figure.add_subplot(xscale="log", xlabel="measured / target (left of the line: reached)")
+        axes.axvline(1, color="#d55e00", linewidth=1)
+        for row, (part, entry) in enumerate(reversed(ratios)):
+            color = "#0072b2" if entry.reached else "#d55e00"
+            axes.plot([1, part], [row, row], color=color, linewidth=1, alpha=0.4)
+            axes.plot([part], [row], "o", color=color, markersize=5)
+        labels = [f"{entry.name}: {entry.as_row()[1]}" for _, entry in reversed(ratios)]
+        axes.set_yticks(range(len(labels)), labels)
+        axes.margins(y=0.02)
+        axes.grid(axis="x", alpha=0.3)
+        figure.savefig(path, metadata={"Date": None})
+
+
 def headline(sections: Sequence[Section]) -> Table:
     """Return a table of all ratios with their targets."""
     rows = [ratio.as_row() for section in sections for ratio in section.ratios]
@@ -129,6 +157,7 @@ def markdown(
         f"{machine['load_1min']} at its start; commit {machine['commit']}; {packages}."
     )
     parts = [f"# {report.title}", "", made, "", headline(sections).as_markdown()]
+    parts += ["", f"![Each figure beside its target]({report.name}.svg)"]
     for section in sections:
         parts += ["", f"## {section.title}", ""]
         for table in section.tables:
@@ -146,11 +175,12 @@ def write(
     target: str,
     report: Report = BENCH,
 ) -> None:
-    """Write the report as Markdown and JSON."""
+    """Write the report as Markdown and JSON, and its picture."""
     folder.mkdir(parents=True, exist_ok=True)
     if report.merged and (folder / f"{report.name}.json").exists():
         sections, machine = _merged(*read(folder, report), sections, machine)
     (folder / f"{report.name}.md").write_text(markdown(sections, machine, target, report))
+    draw(sections, folder / f"{report.name}.svg")
     content = {"target": target, "machine": machine, "sections": list(map(asdict, sections))}
     (folder / f"{report.name}.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
 

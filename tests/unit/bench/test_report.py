@@ -61,6 +61,30 @@ def test_a_ratio_reaches_its_target_or_not(value, target, at_least, reached):
     assert Ratio("r", value, target, at_least=at_least).reached is reached
 
 
+@pytest.mark.parametrize(
+    ("figure", "part"),
+    [
+        (Ratio("r", 1.0, 2.0), 0.5),
+        (Ratio("r", 10, 20, at_least=True), 2),
+        (Ratio("r", 3, None), None),
+        (Ratio("r", 0, 0), None),
+        (Ratio("r", 1, 0), None),
+    ],
+)
+def test_a_figure_stands_beside_its_target(figure, part):
+    assert figure.of_target == part
+
+
+def test_the_picture_names_every_figure_that_has_a_target_of_its_own(tmp_path):
+    figures = Ratio("fast", 1.0, 2.0), Ratio("lost", 0, 0), Ratio("rare", 3, None)
+    writer.write(tmp_path, [_section(*figures)], MACHINE, "embedded")
+    picture = (tmp_path / "report.svg").read_text()
+    assert "fast: 1" in picture
+    assert "lost" not in picture
+    assert "rare" not in picture
+    assert "(report.svg)" in (tmp_path / "report.md").read_text()
+
+
 def test_a_figure_is_shown_to_four_digits_and_a_count_whole():
     section = Section("query", "")
     for value in (1.23456, 12_345, None):
