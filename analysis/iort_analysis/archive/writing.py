@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import groupby
+from itertools import groupby, islice
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -31,7 +31,7 @@ from iort_analysis.archive.columns import (
     to_values,
 )
 from iort_analysis.archive.reading import HOURS, KINDS, ArchiveFile
-from iort_analysis.samples.batches import decode_together
+from iort_analysis.samples.batches import Steps, decode_steps, steps_of
 from iort_analysis.samples.blocks import Block, Column, column_of, join, objects
 from iort_contract.archive import Hour, content_hash, item_hash
 from iort_contract.catalog.streams import CATALOG
@@ -39,7 +39,7 @@ from iort_contract.checks import integer
 from iort_contract.codec import EXACT, packed_samples, unpacked
 from iort_contract.dynamodb import Item, plain, whole
 from iort_contract.limits import ContractError, Value
-from iort_contract.messages.batch import BatchId, Opened, open_batch
+from iort_contract.messages.batch import BatchId, Envelope, open_envelope, read_envelope
 from iort_contract.ros1.columns import view
 from iort_contract.ros1.message import Messages, unpack
 from iort_contract.tables import BATCH, EXPIRES_S, NONFINITE, PREVIOUS, RECEIVED_MS
@@ -64,20 +64,24 @@ class Piece(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """A valid item: its batch; its ROS messages, if it has them as published, and the fields in them."""
+    """A valid item: what its batch says beside the samples, and the names of its columns; and its ROS
+    messages, if it has them as published, with the fields in them."""
 
     item: Item
-    opened: Opened
-    messages: Messages | None
-    viewed: tuple[str, ...] = ()
+    id: BatchId
+    n: int
+    nonfinite: int
+    about: str
+    names: Sequence[str]
+    messages: Messages | None = None
+    viewed: Sequence[str] = ()
 
 
 def pieces(items: Iterable[Item], refuse: Refuse) -> Iterator[Piece]:
     """The items' batches in pieces, in the order of the items. Items that are no batches go to ``refuse``."""
     parts: list[tuple[list[_Entry], Block]] = []
     rows = values = size = 0
-    for entries in _opened(items, refuse):
-        part = _decoded(entries, refuse)
+    for part in _decoded(items, refuse):
         rows += len(part[1].times_us)
         values += len(part[1].times_us) * len(part[1].columns)
         size += sum(len(raw) for one in part[0] if one.messages for raw in one.messages.raw)
@@ -94,92 +98,70 @@ def _text(column: Column) -> int:
     return sum(len(value) for value in column if type(value) is str) if column.dtype.kind == "O" else 0
 
 
-def _opened(items: Iterable[Item], refuse: Refuse) -> Iterator[list[_Entry]]:
-    """Runs of valid items whose batches have the same fields."""
-
-    def each() -> Iterator[_Entry]:
-        for item in items:
-            try:
-                opened = open_batch(plain(item))
-                messages = None
-                if opened.serialized is not None:
-                    messages = unpack(opened.serialized, len(opened.times_us))
-                yield _Entry(item, opened._replace(serialized=None), messages)
-            except ContractError as error:  # noqa: PERF203 - each is refused by itself
-                refuse(item, str(error))
-
-    for _, same in groupby(each(), key=lambda one: (list(one.opened.written), one.messages is None)):
-        run: list[_Entry] = []
-        for one in same:
-            run.append(one)
-            if len(run) == _TOGETHER:
-                yield run
-                run = []
-        if run:
-            yield run
+def _decoded(items: Iterable[Item], refuse: Refuse) -> Iterator[tuple[list[_Entry], Block]]:
+    """The valid items some at a time, with all their samples."""
+    for _, same in groupby(_envelopes(items, refuse), key=lambda one: one[2] and one[2].names):
+        while run := list(islice(same, _TOGETHER)):
+            steps = [written for _, _, written in run if written is not None]
+            block = decode_steps(steps, lambda _name: True) if len(steps) == len(run) else None
+            if block is not None:
+                yield [_of_steps(item, envelope, block) for item, envelope, _ in run], block
+                continue
+            entries, blocks = [], []
+            for item, envelope, _ in run:
+                try:
+                    entry, own = _alone(item, envelope)
+                except ContractError as error:  # noqa: PERF203 - each is refused by itself
+                    refuse(item, str(error))
+                else:
+                    entries.append(entry)
+                    blocks.append(own)
+            yield entries, join(blocks)
 
 
-def _decoded(run: list[_Entry], refuse: Refuse) -> tuple[list[_Entry], Block]:
-    """The valid ones of a run, without their written values, and all their samples."""
-    if run[0].messages is None:
+def _envelopes(items: Iterable[Item], refuse: Refuse) -> Iterator[tuple[Item, Envelope, Steps | None]]:
+    for item in items:
         try:
-            block = decode_together([one.opened for one in run], list(run[0].opened.written))
-            if not any(map(_is_much, run)):
-                return list(map(_without_values, run)), _exact(block, lambda name: _values(run, name))
-        except ContractError:
-            pass  # Each by itself tells which one is invalid.
-    valid, blocks = [], []
-    for one in run:
-        try:
-            decoded, block = _alone(one)
-        except ContractError as error:  # noqa: PERF203 - as above
-            refuse(one.item, str(error))
+            envelope = read_envelope(plain(item))
+        except ContractError as error:  # noqa: PERF203 - each is refused by itself
+            refuse(item, str(error))
         else:
-            valid.append(_without_values(decoded))
-            blocks.append(block)
-    return valid, join(blocks)
+            yield item, envelope, steps_of(envelope) if len(envelope.behind) <= _MUCH_TEXT else None
 
 
-def _without_values(one: _Entry) -> _Entry:
-    return one._replace(opened=one.opened._replace(written=dict.fromkeys(one.opened.written)))
+def _of_steps(item: Item, envelope: Envelope, block: Block) -> _Entry:
+    key = BatchId(envelope.first_us, envelope.boot, envelope.seq)
+    about = envelope.behind.decode()
+    return _Entry(item, key, envelope.n, envelope.nonfinite, about, list(block.columns))
 
 
-def _is_much(one: _Entry) -> bool:
-    texts = sum(len(v) for column in one.opened.written.values() for v in column if type(v) is str)
-    return texts + len(one.opened.about) > _MUCH_TEXT
+def _alone(item: Item, envelope: Envelope) -> tuple[_Entry, Block]:
+    """A batch in any form; raises `ContractError`."""
+    boot, seq, times, nonfinite, columns, serialized, about, _ = open_envelope(envelope)
+    n = len(times)
+    beside = {name: unpacked(name, column, n) for name, column in columns.items()}
+    texts = sum(len(value) for column in beside.values() for value in column if type(value) is str)
+    if texts + len(about) > _MUCH_TEXT:
+        packed_samples([0] * n, beside, about.encode())
+    messages = None if serialized is None else unpack(serialized, n)
+    viewed = {} if messages is None else view(messages)[0]
+    entry = _Entry(
+        item, BatchId(times[0], boot, seq), n, nonfinite, about, list(beside), messages, list(viewed)
+    )
+    samples = {name: _exact(values) for name, values in {**viewed, **beside}.items()}
+    return entry, Block(np.array(times, dtype=np.int64), samples)
 
 
-def _alone(one: _Entry) -> tuple[_Entry, Block]:
-    _, _, times, _, written, _, about, _ = one.opened
-    beside = {name: unpacked(name, column, len(times)) for name, column in written.items()}
-    if _is_much(one):
-        packed_samples([0] * len(times), beside, about.encode())
-    viewed = view(one.messages)[0] if one.messages is not None else {}
-    columns = {**viewed, **beside}
-    block = Block(np.array(times, dtype=np.int64), {name: column_of(v) for name, v in columns.items()})
-    return one._replace(viewed=tuple(viewed)), _exact(block, columns.__getitem__)
-
-
-def _exact(block: Block, values_of: Callable[[str], Sequence[Value]]) -> Block:
-    """The block with integers of more than 53 bits as Python's: a float64 does not tell them from floats."""
-    for name, column in block.columns.items():
-        if column.dtype.kind == "f" and bool((np.abs(column) >= EXACT).any()):
-            values = values_of(name)
-            if any(type(value) is int and abs(value) >= EXACT for value in values):
-                block.columns[name] = objects(values)
-    return block
-
-
-def _values(run: list[_Entry], name: str) -> list[Value]:
-    return [
-        value for one in run for value in unpacked(name, one.opened.written[name], len(one.opened.times_us))
-    ]
+def _exact(values: Sequence[Value]) -> Column:
+    """A column; with integers of more than 53 bits as Python's: a float64 does not tell them from floats."""
+    large = any(type(value) is int and abs(value) >= EXACT for value in values)
+    return objects(values) if large else column_of(values)
 
 
 def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:
     entries = [one for part, _ in parts for one in part]
     block = join([part for _, part in parts])
-    counts = np.array([len(one.opened.times_us) for one in entries])
+    counts = np.array([one.n for one in entries])
     messages = [raw for one in entries for raw in _raws(one)]
     own = {
         names.TIME: pa.array(block.times_us, type=OWN[names.TIME]),
@@ -187,13 +169,13 @@ def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:
         names.OTHER: pa.nulls(len(block.times_us), OWN[names.OTHER]),
     }
     of_batches: dict[str, list[Any]] = {
-        names.BATCH_ID: [_id(one) for one in entries],
+        names.BATCH_ID: [str(one.id) for one in entries],
         names.RECEIVED: [_received_ms(one.item) for one in entries],
-        names.NOT_FINITE: [one.opened.nonfinite if NONFINITE in one.item else None for one in entries],
+        names.NOT_FINITE: [one.nonfinite if NONFINITE in one.item else None for one in entries],
         names.PREVIOUS_RUNS: [one.item[PREVIOUS]["S"] if PREVIOUS in one.item else None for one in entries],
         names.HASH: [item_hash(one.item) for one in entries],
         names.FIELDS: [_fields(one) for one in entries],
-        names.ABOUT: [one.opened.about or None for one in entries],
+        names.ABOUT: [one.about or None for one in entries],
         names.TYPE: [one.messages.type_id if one.messages else None for one in entries],
         names.LAYOUT: [one.messages.layout if one.messages else None for one in entries],
     }
@@ -204,11 +186,7 @@ def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:
 
 
 def _raws(one: _Entry) -> Iterable[bytes | None]:
-    return [None] * len(one.opened.times_us) if one.messages is None else one.messages.raw
-
-
-def _id(one: _Entry) -> str:
-    return str(BatchId(one.opened.times_us[0], one.opened.boot, one.opened.seq))
+    return [None] * one.n if one.messages is None else one.messages.raw
 
 
 def _received_ms(item: Item) -> int | None:
@@ -219,8 +197,8 @@ def _received_ms(item: Item) -> int | None:
 
 
 def _fields(one: _Entry) -> str:
-    written = ",".join(one.opened.written)
-    return written if one.messages is None else f"{','.join(one.viewed)}|{written}"
+    own = ",".join(one.names)
+    return own if one.messages is None else f"{','.join(one.viewed)}|{own}"
 
 
 # Gives a field's unit and its meaning, each perhaps empty.

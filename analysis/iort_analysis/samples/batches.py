@@ -1,31 +1,28 @@
 """Stored batches to blocks of samples.
 
-`iort_contract` checks every batch and decodes it to lists. Columns of steps are decoded here too, with numpy
-and many batches at a time: the same checks, twice as fast. Batches of steps alone are not even read as JSON
-(`iort_analysis.samples.batches`)."""
+`iort_contract` checks every batch and decodes it to lists. Batches of steps alone, which nearly all are, are
+decoded here many at a time by numpy, without reading their JSON."""
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain, groupby, repeat
+from itertools import chain, groupby
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.samples.blocks import EMPTY, Block, Column, column_of, join, joined, ordered
+from iort_analysis.samples.blocks import EMPTY, Block, column_of, join, ordered
 from iort_contract.checks import check_field, shown
-from iort_contract.codec import CODEC, EXACT, SCALES, check_sums, decimals_of, not_integers, plain_values
+from iort_contract.codec import CODEC, EXACT, SCALES
 from iort_contract.dynamodb import plain
 from iort_contract.limits import MAX_BATCH_SPAN_US, MAX_BATCH_VALUES, MAX_FIELDS, ContractError
 from iort_contract.messages.batch import (
     Batch,
     BatchId,
     Envelope,
-    Opened,
     batch_id,
     decode_batch,
     decode_opened,
@@ -49,7 +46,7 @@ _ZERO = np.uint8(ord("0"))
 _Integers: TypeAlias = NDArray[np.int64]
 
 
-class Written(NamedTuple):
+class Steps(NamedTuple):
     """The names of a batch's fields, and its lists, of ``dt`` and of each field: each is ``:[...],``."""
 
     envelope: Envelope
@@ -57,7 +54,7 @@ class Written(NamedTuple):
     lists: bytes
 
 
-def written(envelope: Envelope) -> Written | None:
+def steps_of(envelope: Envelope) -> Steps | None:
     """The parts of a batch that may have steps only; None for any other form."""
     text = envelope.text
     if envelope.codec != CODEC or b"\\" in text or not text.endswith(b"]}}"):
@@ -68,10 +65,10 @@ def written(envelope: Envelope) -> Written | None:
         return None
     if len(names) > MAX_FIELDS or envelope.n * len(names) > MAX_BATCH_VALUES:
         return None
-    return Written(envelope, names, b"".join((parts[2], *parts[6::2]))[:-2] + b",")
+    return Steps(envelope, names, b"".join((parts[2], *parts[6::2]))[:-2] + b",")
 
 
-def decoded(run: Sequence[Written], wanted: Callable[[str], bool]) -> Block | None:
+def decode_steps(run: Sequence[Steps], wanted: Callable[[str], bool]) -> Block | None:
     """The samples of batches with the same names of fields; None if one of them has another form."""
     try:
         names = [check_field(name.decode()) for name in run[0].names]
@@ -162,7 +159,6 @@ def integers(lists: bytes, lengths: _Integers) -> _Integers | None:
 ATTRIBUTES = ("v", BATCH, SAMPLES, NONFINITE, "codec", "samples")
 # So many of what cannot be read are named.
 MOST_NAMED = 20
-_SCALES = np.array(SCALES)
 # The arrays of so much text fit in a processor's cache, and malloc keeps memory for them.
 _TOGETHER_BYTES = 40 * 1024
 Item = Mapping[str, Any]
@@ -218,12 +214,12 @@ def part(
     """The samples of a page of items, in the order of its batches. Without ``messages``, ROS messages
     are skipped."""
     found: list[Block] = []
-    for run in _runs(_written(items, refused)):
-        steps = [one for one in run if isinstance(one, Written) and (messages or not one.envelope.behind)]
-        block = decoded(steps, wanted) if len(steps) == len(run) else None
+    for run in _runs(_read(items, refused)):
+        steps = [one for one in run if isinstance(one, Steps) and (messages or not one.envelope.behind)]
+        block = decode_steps(steps, wanted) if len(steps) == len(run) else None
         if block is None:
-            envelopes = (one.envelope if isinstance(one, Written) else one for one in run)
-            block = _block(_opened(envelopes, refused, messages=messages), refused, wanted)
+            envelopes = (one.envelope if isinstance(one, Steps) else one for one in run)
+            block = join(list(_by_contract(envelopes, refused, wanted, messages=messages)))
         found.append(block)
     return Part(join(found), start_us(items[-1]) if items else 0)
 
@@ -262,71 +258,45 @@ def start_us(item: Item) -> int:
         return 0
 
 
-def _written(items: Iterable[Item], refused: RefusedItems) -> Iterator[Written | Envelope]:
+def _read(items: Iterable[Item], refused: RefusedItems) -> Iterator[Steps | Envelope]:
     for item in items:
         try:
             envelope = read_envelope(plain({name: item[name] for name in ATTRIBUTES if name in item}))
         except ContractError as error:  # noqa: PERF203 - each batch is refused by itself
             refused.add(error, item.get(BATCH, {}).get("S", "") if isinstance(item.get(BATCH), dict) else "")
         else:
-            yield written(envelope) or envelope
+            yield steps_of(envelope) or envelope
 
 
-def _runs(batches: Iterable[Written | Envelope]) -> Iterator[list[Written | Envelope]]:
+def _runs(batches: Iterable[Steps | Envelope]) -> Iterator[list[Steps | Envelope]]:
     """Batches of the same fields one after the other, as many as are decoded together."""
-    run: list[Written | Envelope] = []
+    run: list[Steps | Envelope] = []
     names: tuple[bytes, ...] | None = None
     size = 0
     for batch in batches:
-        own = batch.names if isinstance(batch, Written) else None
+        own = batch.names if isinstance(batch, Steps) else None
         if run and (own != names or size > _TOGETHER_BYTES):
             yield run
             run, size = [], 0
         names = own
-        size += len(batch.lists) if isinstance(batch, Written) else 0
+        size += len(batch.lists) if isinstance(batch, Steps) else 0
         run.append(batch)
     if run:
         yield run
 
 
-def _opened(envelopes: Iterable[Envelope], refused: RefusedItems, *, messages: bool) -> Iterator[Opened]:
+def _by_contract(
+    envelopes: Iterable[Envelope], refused: RefusedItems, wanted: Wanted, *, messages: bool
+) -> Iterator[Block]:
+    """The samples of batches in any form, one at a time."""
+    batches: list[Batch] = []
     for envelope in envelopes:
         try:
-            batch = open_envelope(envelope)
-        except ContractError as error:
-            refused.add(error, BatchId(envelope.first_us, envelope.boot, envelope.seq))
-            continue
-        if messages or (batch.serialized is None and not batch.about):
-            yield batch
-
-
-def _block(batches: Iterable[Opened], refused: RefusedItems, wanted: Wanted) -> Block:
-    parts: list[Block] = []
-    for (names, is_serialized), same in groupby(batches, key=_form):
-        run = list(same)
-        try:
-            if not is_serialized:
-                parts.append(decode_together(run, list(filter(wanted, names))))
-                continue
-        except ContractError:
-            # The lists tell which batch is invalid.
-            pass
-        parts += decode_each(run, refused, wanted)
-    return join(parts)
-
-
-def _form(batch: Opened) -> tuple[list[str], bool]:
-    return list(batch.written), batch.serialized is not None
-
-
-def decode_each(run: Iterable[Opened], refused: RefusedItems, wanted: Wanted) -> Iterator[Block]:
-    """The list back end: one batch at a time."""
-    batches: list[Batch] = []
-    for one in run:
-        try:
-            batches.append(decode_opened(one))
+            opened = open_envelope(envelope)
+            if messages or (opened.serialized is None and not opened.about):
+                batches.append(decode_opened(opened))
         except ContractError as error:  # noqa: PERF203 - each batch is refused by itself
-            refused.add(error, BatchId(one.times_us[0], one.boot, one.seq))
+            refused.add(error, BatchId(envelope.first_us, envelope.boot, envelope.seq))
     for _, same in groupby(batches, key=lambda batch: list(batch.columns)):
         group = list(same)
         columns = {
@@ -336,50 +306,3 @@ def decode_each(run: Iterable[Opened], refused: RefusedItems, wanted: Wanted) ->
         }
         times = np.fromiter(chain.from_iterable(batch.times_us for batch in group), dtype=np.int64)
         yield Block(times, columns)
-
-
-def decode_together(run: Sequence[Opened], names: Sequence[str]) -> Block:
-    """The numpy back end: batches of the same fields; raises `ContractError` if any is invalid."""
-    counts = [len(batch.times_us) for batch in run]
-    times_us = chain.from_iterable(batch.times_us for batch in run)
-    times = np.fromiter(times_us, dtype=np.int64, count=sum(counts))
-    return Block(times, {name: _column(name, [b.written[name] for b in run], counts) for name in names})
-
-
-def _column(name: str, written: Sequence[Any], counts: Sequence[int]) -> Column:
-    """A field's values from its column in each batch of ``counts`` samples."""
-    decimals = list(map(decimals_of, repeat(name), written, counts))
-    if None not in decimals:
-        return _from_steps(name, written)
-    parts: list[Column] = []
-    for is_plain, group in groupby(zip(decimals, written, strict=True), key=lambda pair: pair[0] is None):
-        some = [column for _, column in group]
-        if is_plain:
-            parts.append(column_of(list(chain.from_iterable(plain_values(name, c) for c in some))))
-        else:
-            parts.append(_from_steps(name, some))
-    return joined([(part, len(part)) for part in parts])
-
-
-def _from_steps(name: str, written: Sequence[list[Any]]) -> Column:
-    """Columns of decimals, first value and steps, as one column of values.
-
-    numpy sums all of them at once; then each column loses the sum of those before it. int64 sums are exact
-    modulo 2**64, and a valid column's sums stay within 53 bits.
-    """
-    try:
-        # An array takes integers and booleans only, and is faster than numpy at that.
-        steps = np.frombuffer(array("q", list(chain.from_iterable(written))), dtype=np.int64)
-    except (TypeError, OverflowError) as error:
-        raise not_integers(name) from error
-    lengths = np.fromiter(map(len, written), dtype=np.int64)
-    starts = np.cumsum(lengths) - lengths
-    decimals = steps[starts]
-    steps[starts] = 0
-    # A larger step leads out of 53 bits, and might lead back through 64.
-    check_sums(name, int(steps.min()) // 2, int(steps.max()) // 2)
-    sums: NDArray[np.int64] = np.cumsum(steps)
-    whole = np.delete(sums - np.repeat(sums[starts], lengths), starts)
-    check_sums(name, int(whole.min()), int(whole.max()))
-    values: Column = whole / np.repeat(_SCALES[decimals], lengths - 1)
-    return values

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_analysis.samples.batches import RefusedItems, decoded, integers, part, written
+from iort_analysis.samples.batches import RefusedItems, decode_steps, integers, part, steps_of
 from iort_contract.codec import DICTIONARY
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch, read_envelope
@@ -76,8 +76,8 @@ def test_whole_drives_take_the_fast_way():
     batches = [
         Batch("0badcafe", seq, [10**15 + seq, 10**15 + seq + 5], {"a": [seq, 2.5]}) for seq in range(3)
     ]
-    run = [written(read_envelope(json.loads(encode_batch(batch)))) for batch in batches]
+    run = [steps_of(read_envelope(json.loads(encode_batch(batch)))) for batch in batches]
     assert None not in run
-    block = decoded(run, lambda name: name == "a")
+    block = decode_steps(run, lambda name: name == "a")
     assert block is not None
     assert block.columns["a"].tolist() == [0, 2.5, 1, 2.5, 2, 2.5]
