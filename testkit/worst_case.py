@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from iort_contract.codec import CODEC, DICTIONARY, PLAIN_CODEC
+from iort_contract.codec import DICTIONARY
 from iort_contract.limits import MAX_BATCH_VALUES
 from iort_contract.messages.batch import Batch, BatchId, encode_batch
 from iort_contract.tables import BATCH
@@ -42,22 +42,16 @@ def worst_batches(count: int, *, first_us: int = _T_US) -> Iterator[bytes]:
 
 def cases() -> Iterator[Case]:
     """Yield the most expensive batches that we know, and the largest batch of a good car."""
-    n, fields = 4000, 500
-    zeros = _columns(n, [b"[1.0%s]" % (b",1.0" * (n - 1))] * fields)
-    yield Case("two million equal values, in the codec of before", _message(PLAIN_CODEC, n, zeros))
+    n = 4000
     steps = _columns(n, [b"[3,1%s]" % (b",0" * (n - 1))] * 490)
-    yield Case("two million equal values", _message(CODEC, n, steps))
+    yield Case("two million equal values", _message(n, steps))
     lists = _columns(1, [b"[%s0]" % (b"[]," * 1_300_000)])
-    yield Case("a million empty lists", _message(CODEC, 1, lists))
+    yield Case("a million empty lists", _message(1, lists))
     n = MAX_BATCH_VALUES
-    texts = [b"[0.5%s]" % ((b',"' + rb"\n" * 75 + b'"') * (n - 1))]
-    yield Case(
-        f"{n:,} texts full of escapes, in the codec of before", _message(PLAIN_CODEC, n, _columns(n, texts))
-    )
     texts = [b"[null%s]" % ((b',"' + rb"\n" * 36 + b'"') * n)]
-    yield Case(_WORST, _message(CODEC, n, _columns(n, texts)))
+    yield Case(_WORST, _message(n, _columns(n, texts)))
     numbers = [b"[3,1000%s]" % (b",500" * (n - 1))]
-    yield Case(f"{n:,} numbers of one field", _message(CODEC, n, _columns(n, numbers)))
+    yield Case(f"{n:,} numbers of one field", _message(n, _columns(n, numbers)))
     chance = random.Random(1)  # noqa: S311 - a noise, not a secret
     n = 434
     columns = {f"f{i}": [round(chance.gauss(10, 3), 3) for _ in range(n)] for i in range(46)}
@@ -70,8 +64,8 @@ def _columns(n: int, columns: list[bytes]) -> bytes:
     return b'{"dt":[0%s],"fields":{%s}}' % (b",1" * (n - 1), named)
 
 
-def _message(codec: str, n: int, body: bytes) -> bytes:
-    deflater = zlib.compressobj(9, zdict=DICTIONARY if codec == CODEC else b"")
+def _message(n: int, body: bytes) -> bytes:
+    deflater = zlib.compressobj(9, zdict=DICTIONARY)
     samples = base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
     head = json.loads(encode_batch(Batch(_BOOT, 0, [_T_US], {})))
-    return json.dumps({**head, "n": n, "codec": codec, "samples": samples}).encode()
+    return json.dumps({**head, "n": n, "samples": samples}).encode()

@@ -10,7 +10,7 @@ import zlib
 from random import Random
 from typing import Any
 
-from iort_contract.codec import DICTIONARY, PLAIN_CODEC
+from iort_contract.codec import DICTIONARY
 
 Item = dict[str, Any]
 # What stands where something else should.
@@ -86,7 +86,7 @@ def mutated_json(random: Random, text: bytes) -> bytes:
     return json.dumps(mutated_value(random, json.loads(text))).encode()
 
 
-def mutated_samples(random: Random, codec: str, samples: str) -> str:
+def mutated_samples(random: Random, samples: str) -> str:
     """The samples of a batch, damaged in their text, in the compressed bytes, or in what was compressed."""
     kind = random.randrange(6)
     if kind == 0:
@@ -94,15 +94,14 @@ def mutated_samples(random: Random, codec: str, samples: str) -> str:
     packed = base64.b64decode(samples)
     if kind == 1:
         return base64.b64encode(mutated_bytes(random, packed)).decode()
-    zdict = b"" if codec == PLAIN_CODEC else DICTIONARY
-    text, line, behind = zlib.decompressobj(zdict=zdict).decompress(packed).partition(b"\n")
+    text, line, behind = zlib.decompressobj(zdict=DICTIONARY).decompress(packed).partition(b"\n")
     if kind == 2 and behind:
         behind = mutated_json(random, behind) if behind[:1] == b"[" else mutated_bytes(random, behind)
     elif kind < 5:
         text = mutated_bytes(random, text)
     else:
         text = json.dumps(mutated_value(random, json.loads(text)), separators=(",", ":")).encode()
-    deflater = zlib.compressobj(1, zdict=zdict) if zdict else zlib.compressobj(1)
+    deflater = zlib.compressobj(1, zdict=DICTIONARY)
     return base64.b64encode(deflater.compress(text + line + behind) + deflater.flush()).decode()
 
 
@@ -123,7 +122,7 @@ def mutated_item(
             item[name] = copy.deepcopy(random.choice(attributes))
         elif isinstance(samples := item["samples"].get("S"), str) and isinstance(item.get("codec"), dict):
             try:
-                item["samples"] = {"S": mutated_samples(random, item["codec"].get("S", ""), samples)}
+                item["samples"] = {"S": mutated_samples(random, samples)}
             except (ValueError, zlib.error):
                 del item["samples"]
         if not item.keys() - keep:

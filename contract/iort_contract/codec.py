@@ -2,7 +2,7 @@
 
 A column is a list whose first entry is its decimals. After a number follow the first value and the step from
 each value to the next, as integers: the values times ten to the power of the decimals. After null follow the
-plain values. In `PLAIN_CODEC` a column was the plain values only."""
+plain values."""
 
 from __future__ import annotations
 
@@ -25,15 +25,11 @@ from iort_contract.limits import (
 )
 from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
 
-# Codecs of new batches and of stored ones, which stay readable for ever. `SERIALIZED_CODEC` keeps ROS
-# messages byte for byte: contract/iort_contract/ros1/message.py.
-CODEC, SERIALIZED_CODEC, PLAIN_CODEC = "steps", "ros1", "columns+zlib+base64"
+# Batches stay readable for ever. `SERIALIZED_CODEC` keeps ROS messages byte for byte:
+# contract/iort_contract/ros1/message.py.
+CODEC, SERIALIZED_CODEC = "steps", "ros1"
 # A step has half the characters of its value, and takes as much memory.
-_MOST_BYTES = {
-    CODEC: MAX_COLUMNS_BYTES // 2,
-    SERIALIZED_CODEC: MAX_COLUMNS_BYTES + 2 * 1024 * 1024,
-    PLAIN_CODEC: MAX_COLUMNS_BYTES,
-}
+_MOST_BYTES = {CODEC: MAX_COLUMNS_BYTES // 2, SERIALIZED_CODEC: MAX_COLUMNS_BYTES + 2 * 1024 * 1024}
 # zlib's preset dictionary. It is frozen with the codec's name, since stored batches need it. An unknown field
 # costs its name. The end of the dictionary is the cheapest to refer to.
 DICTIONARY = (
@@ -78,7 +74,7 @@ def inflate(samples: Any, codec: str) -> bytes:
     most = _MOST_BYTES[codec]
     try:
         deflated = base64.b64decode(samples, validate=True)
-        inflater = zlib.decompressobj(zdict=b"" if codec == PLAIN_CODEC else DICTIONARY)
+        inflater = zlib.decompressobj(zdict=DICTIONARY)
         body = inflater.decompress(deflated, most + 1)
     except (binascii.Error, ValueError, zlib.error) as error:
         raise ContractError(f"samples must be base64 of zlib: {error}") from error

@@ -24,7 +24,6 @@ from iort_contract.checks import (
 )
 from iort_contract.codec import (
     CODEC,
-    PLAIN_CODEC,
     SERIALIZED_CODEC,
     check_effort,
     inflate,
@@ -265,8 +264,8 @@ def read_envelope(message: bytes | str | Mapping[str, Any]) -> Envelope:
     envelope = message if isinstance(message, (dict, Mapping)) else json_object(message, "envelope")
     check_version(envelope, BATCH_VERSION)
     codec = envelope.get("codec")
-    if codec not in (CODEC, SERIALIZED_CODEC, PLAIN_CODEC):
-        raise ContractError(f"codec must be {CODEC}, {SERIALIZED_CODEC} or {PLAIN_CODEC}, got {shown(codec)}")
+    if codec not in (CODEC, SERIALIZED_CODEC):
+        raise ContractError(f"codec must be {CODEC} or {SERIALIZED_CODEC}, got {shown(codec)}")
     first_us, boot, seq = batch_id(envelope.get(BATCH))
     n = integer(envelope, SAMPLES)
     nonfinite = check_nonfinite(integer(envelope, NONFINITE)) if NONFINITE in envelope else 0
@@ -303,11 +302,6 @@ def open_envelope(envelope: Envelope) -> Opened:
     check_times(times)
     for name in fields:
         check_field(name)
-    if codec == PLAIN_CODEC:
-        # A column that is no list fails its own check.
-        fields = {
-            name: [None, *column] if isinstance(column, list) else column for name, column in fields.items()
-        }
     if codec == SERIALIZED_CODEC:
         return Opened(boot, seq, times, nonfinite, fields, behind, "", previous)
     return Opened(boot, seq, times, nonfinite, fields, None, _text(behind), previous)

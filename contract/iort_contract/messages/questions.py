@@ -20,7 +20,6 @@ from iort_contract.checks import (
     shown,
     text,
 )
-from iort_contract.codec import PLAIN_CODEC
 from iort_contract.limits import SCHEMA_VERSION, ContractError, Value
 from iort_contract.messages.envelope import entries, read, to_json
 from iort_contract.messages.files import check_sha256, parse_file_key
@@ -176,6 +175,8 @@ def _body(envelope: Mapping[str, Any], large: str, place: str) -> Mapping[str, A
     return body
 
 
+# An answer's samples: zlib of JSON with plain values.
+_CODEC = "columns+zlib+base64"
 # The times of a request without a start or an end.
 FIRST_US, LAST_US = -(2**53), 2**53
 
@@ -240,7 +241,7 @@ def encode_query_answer(answer: QueryAnswer) -> dict[str, Any]:
     """The answer as an object for JSON."""
     if answer.error:
         return {"error": answer.error}
-    reply = {"codec": PLAIN_CODEC, **asdict(replace(answer, samples=None))}
+    reply = {"codec": _CODEC, **asdict(replace(answer, samples=None))}
     if answer.samples is not None:
         reply["samples"] = base64.b64encode(answer.samples).decode()
     return {name: value for name, value in reply.items() if value is not None or name == "token"}
@@ -251,8 +252,8 @@ def decode_query_answer(message: bytes | str) -> QueryAnswer:
     answer = json_object(message, "the query function's answer")
     if answer.get("error"):
         return QueryAnswer(error=text(answer, "error"))
-    if answer.get("codec") != PLAIN_CODEC:
-        raise ContractError(f"codec must be {PLAIN_CODEC}, got {shown(answer.get('codec'))}")
+    if answer.get("codec") != _CODEC:
+        raise ContractError(f"codec must be {_CODEC}, got {shown(answer.get('codec'))}")
     present = {name: value for name, value in answer.items() if value is not None}
     if ("samples" in present) == ("url" in present):
         raise ContractError("an answer must have either samples or url")

@@ -6,18 +6,16 @@ import base64
 import json
 import math
 import re
-import struct
 import tracemalloc
 import zlib
-from dataclasses import fields, replace
+from dataclasses import replace
 from decimal import Decimal
 
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from iort_contract.catalog.vesc import VESC_FIELDS
-from iort_contract.codec import PLAIN_CODEC, inflate
+from iort_contract.codec import DICTIONARY, inflate
 from iort_contract.limits import (
     MAX_BATCH_SPAN_US,
     MAX_COLUMNS_BYTES,
@@ -82,20 +80,7 @@ def test_batch_round_trip(batch):
     assert_same_batch(decode_batch(message.decode()), batch)
     assert_same_batch(decode_batch(json.loads(message)), batch)
     assert_same_batch(decode_batch(stored(message)), batch)
-    assert batch.t_us == batch.times_us[0]
-
-
-@given(batches())
-def test_encoding_again_gives_the_same_message(batch):
-    message = encode_batch(batch)
     assert encode_batch(decode_batch(message)) == message
-
-
-@pytest.mark.parametrize("n", [1, 2, 50, 1000])
-def test_a_batch_of_a_drive_is_decoded_as_it_was_encoded(n):
-    columns = {name: [i / 7 for i in range(n)] for name in VESC_FIELDS}
-    batch = Batch(BOOT, 7, [i * 999 for i in range(n)], columns)
-    assert decode_batch(encode_batch(batch)) == batch
 
 
 def test_whole_floats_become_integers_on_the_wire():
@@ -129,11 +114,6 @@ def test_the_envelope_has_nonfinite_only_with_nonfinite_values():
         assert decode_batch({**envelope, "nonfinite": count}).nonfinite == count
 
 
-def test_samples_with_equal_times_keep_their_number_and_order():
-    batch = Batch(BOOT, 0, [5, 5, 5, 6], {"a": [3, 1, 2, 0]})
-    assert decode_batch(encode_batch(batch)) == batch
-
-
 @given(batches(kinds=anything))
 def test_nonfinite_becomes_null_and_is_counted(batch):
     message = encode_batch(batch)
@@ -146,12 +126,6 @@ def test_nonfinite_becomes_null_and_is_counted(batch):
     )
     clean = replace(batch, columns=expected, nonfinite=batch.nonfinite + new)
     assert_same_batch(decode_batch(message), clean)
-
-
-def test_a_float_keeps_all_its_bits():
-    numbers = [struct.unpack("<d", struct.pack("<Q", bits))[0] for bits in (1, 2**52 - 1, 0x7FEFFFFFFFFFFFFF)]
-    batch = Batch(BOOT, 0, [0, 1, 2], {"x": numbers})
-    assert decode_batch(encode_batch(batch)).columns["x"] == numbers
 
 
 @given(batches())
@@ -233,36 +207,25 @@ def test_columns_too_large_for_the_decoder_are_not_encoded():
         assert decode_batch(encode_batch(half)) == half
 
 
-def test_dataclasses_are_frozen():
-    for one in (GOOD, GOOD_LIVE):
-        with pytest.raises(AttributeError):
-            setattr(one, fields(one)[0].name, "x")
-
-
 # Batches that another program wrote: the error names the fault of the body or the envelope.
 
 
 def enveloped(body, **changed):
-    """A valid envelope of two samples with any body, in the codec that stores plain values;
-    tests/unit/contract/test_codec.py has the other."""
-    packed = base64.b64encode(zlib.compress(body)).decode()
-    return dict(json.loads(encode_batch(GOOD)), codec=PLAIN_CODEC, samples=packed, **changed)
-
-
-@given(st.binary(max_size=100) | json_values.map(lambda value: json.dumps(value).encode()))
-def test_any_body_is_decoded_or_refused(body):
-    decode_or_refuse(decode_batch, enveloped(body))
+    """A valid envelope of two samples with any body."""
+    deflater = zlib.compressobj(zdict=DICTIONARY)
+    samples = base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
+    return dict(json.loads(encode_batch(GOOD)), samples=samples, **changed)
 
 
 @examples(300)
 @given(st.data(), json_values)
 def test_body_with_one_part_replaced(data, value):
-    body = {"dt": [0, 5], "fields": {"a": [1, 2.5], "b": ["x", None]}}
+    body = {"dt": [0, 5], "fields": {"a": [None, 1, 2.5], "b": [None, "x", None]}}
     where = data.draw(st.sampled_from(["dt", "fields", "a", "b", "dt 0", "dt 1", "a 1", "name"]))
     if where in body:
         body[where] = value
     elif where == "name":
-        body["fields"][data.draw(st.text(st.characters(), max_size=5))] = [1, 2]
+        body["fields"][data.draw(st.text(st.characters(), max_size=5))] = [0, 1, 2]
     elif where in "ab":
         body["fields"][where] = value
     else:
@@ -276,18 +239,18 @@ BODIES = [
     (b"[]", "not a JSON object"),
     (b"{}", "2 dt"),
     (b"\xff\xfe{}", "not JSON"),
-    (b'{"dt":[0,5],"fields":{"a":["\xff",1]}}', "not JSON"),
+    (b'{"dt":[0,5],"fields":{"a":[null,"\xff",1]}}', "not JSON"),
     (b"[" * DEEP, "nested"),
     (b'{"dt":' + b"[" * DEEP + b"]" * DEEP + b',"fields":{}}', "must be columns"),
     (b'{"dt":[0,5],"fields":' + b'{"a":' * DEEP + b"0" + b"}" * DEEP + b"}", "too many texts"),
-    (b'{"dt":[0,5],"fields":{"a":[' + b"[" * 500 + b"]" * 500 + b",1]}}", "must hold numbers"),
-    (b'{"dt":[0,5],"fields":{"a":[1,NaN]}}', "NaN"),
-    (b'{"dt":[0,5],"fields":{"a":[1,1e999]}}', "field a: numbers must be finite"),
-    (b'{"dt":[0,5],"fields":{"a":[1,18446744073709551616]}}', "field a: integers must fit"),
-    (b'{"dt":[0,5],"fields":{"a":[1,' + b"9" * 9000 + b"]}}", "not JSON|must fit"),
-    (b'{"dt":[0,5],"fields":{"a":[1,"\\ud800"]}}', "field a: texts must"),
-    (b'{"dt":[0,5],"fields":{"a":["' + b"x" * 4097 + b'",1]}}', "field a: texts must"),
-    (b'{"dt":[0,5],"fields":{"\\ud800":[1,1]}}', "field name"),
+    (b'{"dt":[0,5],"fields":{"a":[null,' + b"[" * 500 + b"]" * 500 + b",1]}}", "must hold numbers"),
+    (b'{"dt":[0,5],"fields":{"a":[null,1,NaN]}}', "NaN"),
+    (b'{"dt":[0,5],"fields":{"a":[null,1,1e999]}}', "field a: numbers must be finite"),
+    (b'{"dt":[0,5],"fields":{"a":[null,1,18446744073709551616]}}', "field a: integers must fit"),
+    (b'{"dt":[0,5],"fields":{"a":[null,1,' + b"9" * 9000 + b"]}}", "not JSON|must fit"),
+    (b'{"dt":[0,5],"fields":{"a":[null,1,"\\ud800"]}}', "field a: texts must"),
+    (b'{"dt":[0,5],"fields":{"a":[null,"' + b"x" * 4097 + b'",1]}}', "field a: texts must"),
+    (b'{"dt":[0,5],"fields":{"\\ud800":[null,1,1]}}', "field name"),
     (b'{"dt":[0,5],"fields":{"a":{"0":1,"1":2}}}', "field a must have 2 values"),
     (b'{"dt":[0,5],"fields":{"a":"ab"}}', "field a must have 2 values"),
     (b'{"dt":[0],"fields":{}}', "2 dt"),
@@ -320,18 +283,18 @@ def test_too_many_fields_are_refused():
 
 
 def test_the_last_of_duplicate_keys_counts():
-    body = b'{"dt":[9],"fields":{"b":[1]},"dt":[0,5],"fields":{"a":[9,9],"a":[1,2]}}'
+    body = b'{"dt":[9],"fields":{"b":[0,1]},"dt":[0,5],"fields":{"a":[0,9,9],"a":[0,1,1]}}'
     assert decode_batch(enveloped(body)).columns == {"a": [1, 2]}
 
 
 def test_a_body_up_to_the_size_limit_is_read():
-    n = 8_388_608 // 4096
+    n, most = 1024, MAX_COLUMNS_BYTES // 2
     times = {"dt": [0] + [1] * (n - 1)}
-    room = MAX_COLUMNS_BYTES - len(json.dumps({**times, "fields": {"a": [""] * n}}))
+    room = most - len(json.dumps({**times, "fields": {"a": [None, *[""] * n]}}))
     texts = ["x" * (room // n + (i < room % n)) for i in range(n)]
-    body = json.dumps({**times, "fields": {"a": texts}}).encode()
+    body = json.dumps({**times, "fields": {"a": [None, *texts]}}).encode()
     assert decode_batch(enveloped(body, n=n)).columns == {"a": texts}
-    with pytest.raises(ContractError, match="at most 8388608 bytes"):
+    with pytest.raises(ContractError, match=f"at most {most} bytes"):
         decode_batch(enveloped(body + b" ", n=n))
 
 
@@ -340,14 +303,14 @@ def test_a_zip_bomb_is_not_inflated():
     assert len(message) < MAX_MESSAGE_BYTES
     tracemalloc.start()
     try:
-        with pytest.raises(ContractError, match="at most 8388608 bytes"):
+        with pytest.raises(ContractError, match="at most 4194304 bytes"):
             decode_batch(message)
         assert tracemalloc.get_traced_memory()[1] < 3 * MAX_COLUMNS_BYTES
     finally:
         tracemalloc.stop()
 
 
-PACKED = zlib.compress(b'{"dt":[0,5],"fields":{}}')
+PACKED = base64.b64decode(enveloped(b'{"dt":[0,5],"fields":{}}')["samples"])
 
 
 @pytest.mark.parametrize(
@@ -369,16 +332,12 @@ def test_invalid_packed_samples_are_refused(packed, named):
         decode_batch(envelope)
 
 
-@pytest.mark.parametrize("text", ["é", "a", "====", "eJ\n", "eJ y", "-_-_", "\ud800", "eA==eA=="])
+@pytest.mark.parametrize(
+    "text", ["é", "a", "====", "eJ\n", "eJ y", "-_-_", "\ud800", "eA==eA==", None, 7, [], {}, True]
+)
 def test_samples_that_are_not_base64_are_refused(text):
     with pytest.raises(ContractError, match="samples"):
         decode_batch(dict(enveloped(b""), samples=text))
-
-
-@pytest.mark.parametrize("samples", [None, 7, [], {}, True, Decimal(1)])
-def test_samples_that_are_not_text_are_refused(samples):
-    with pytest.raises(ContractError, match="samples must be base64 text"):
-        decode_batch(dict(enveloped(b""), samples=samples))
 
 
 @pytest.mark.parametrize(
@@ -468,10 +427,3 @@ def test_both_ends_of_a_range_belong_to_it(at):
 def test_an_invalid_id_is_refused(text):
     with pytest.raises(ContractError, match="must be <16 digits of microseconds>-<run>-<number>"):
         batch_id(text)
-
-
-def test_batches_with_equal_times_have_different_keys():
-    """Two publishers, or a recording played twice, give batches of one time that differ in run or number."""
-    same_time = [Batch(boot, seq, [7], {}) for boot in ("0badcafe", "deadbeef") for seq in (0, 9, 10)]
-    assert len({str(batch.id) for batch in same_time}) == len(same_time)
-    assert {decode_batch(encode_batch(batch)).id for batch in same_time} == {b.id for b in same_time}

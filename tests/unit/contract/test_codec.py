@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from iort_contract.catalog.streams import AGENT_FIELDS, RTT_FIELDS
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.checks import wire_column
-from iort_contract.codec import DICTIONARY, PLAIN_CODEC, check_effort, packed, unpacked
+from iort_contract.codec import DICTIONARY, check_effort, packed, unpacked
 from iort_contract.limits import MAX_BATCH_VALUES, ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from tests.examples import examples
@@ -65,41 +65,9 @@ def test_a_column_is_restored_bit_for_bit(column):
     assert bits(unpacked("a", [None, *values], len(values))) == bits(values)
 
 
-@examples(50)
-@given(columns(), st.integers(0, 2**40))
-def test_both_codecs_decode_to_the_same_batch(column, seq):
-    n = len(column)
-    batch = Batch(BOOT, seq, list(range(0, 20 * n, 20)), {"speed": column, "flag": [True] * n})
-    envelope = json.loads(encode_batch(batch))
-    fields = {name: wire_column(name, values)[0] for name, values in batch.columns.items()}
-    before = plain_message(envelope, {"dt": [0] + [20] * (n - 1), "fields": fields})
-    now, then = decode_batch(envelope), decode_batch(before)
-    assert now == then
-    for name in batch.columns:
-        assert bits(now.columns[name]) == bits(then.columns[name])
-
-
-def plain_message(envelope, body):
-    """The same message in the codec of older agents."""
-    samples = base64.b64encode(zlib.compress(json.dumps(body, separators=(",", ":")).encode())).decode()
-    return {**envelope, "codec": "columns+zlib+base64", "samples": samples}
-
-
-# Written by an agent with the older codec, with today's form of the batch id.
-STORED = (
-    b'{"v":2,"batch":"0000000000001000-0123abcd-7","n":3,"nonfinite":0,"codec":"columns+zlib+base64",'
-    b'"samples":"eJyrVkopUbKKNtAxAiJT01gdpbTM1JyUYiWraqVEoIShjoGekU5eaU4OUCoJKKCUr6RTUlSaqpOWmFOcGltbCwBm'
-    b'dxOr"}'
-)
 # Fields that came after the dictionary was frozen.
 NEWER = {"thread_errors"}
 FROZEN = "71f73f6da111bb52e14b827789e70220e1689946c9378dbab0ed3390b2cf0b95"
-
-
-def test_a_batch_of_the_older_codec_is_still_read():
-    assert decode_batch(STORED) == Batch(
-        BOOT, 7, [1000, 1020, 1275], {"a": [1, 0.2, None], "b": ["o", True, False]}
-    )
 
 
 def test_the_compression_dictionary_stays_the_same():
@@ -132,10 +100,15 @@ def test_a_column_is_encoded_as_documented(column, expected):
 def message_of(*fields, n=2):
     """A message of this codec with the given encoded columns."""
     body = {"dt": [0] + [5] * (n - 1), "fields": {f"f{i}": column for i, column in enumerate(fields)}}
+    return enveloped(json.dumps(body).encode(), n)
+
+
+def enveloped(body, n):
+    """A valid envelope with any body."""
     deflater = zlib.compressobj(zdict=DICTIONARY)
-    deflated = deflater.compress(json.dumps(body).encode()) + deflater.flush()
-    good = json.loads(encode_batch(Batch(BOOT, 0, [5 * i for i in range(n)], {"a": [1] * n})))
-    return {**good, "samples": base64.b64encode(deflated).decode()}
+    samples = base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
+    good = json.loads(encode_batch(Batch(BOOT, 0, [0], {"a": [1]})))
+    return {**good, "n": n, "samples": samples}
 
 
 # Encoded columns of two values, and the error that each must give.
@@ -197,21 +170,14 @@ def test_columns_are_bounded_by_their_inflated_size():
         encode_batch(batch)
 
 
-def test_a_batch_cannot_be_read_without_the_dictionary():
-    envelope = json.loads(encode_batch(Batch(BOOT, 0, [0], {"a": [1]})))
-    with pytest.raises(ContractError, match="must be base64 of zlib"):
-        decode_batch({**envelope, "codec": PLAIN_CODEC})
-
-
 # The complexity guard: the largest allowed batch is read; a more expensive one is refused before parsing.
 
-_BOOT = "0123abcd"
 MOST = MAX_BATCH_VALUES
 
 
 def full(fields, value):
     n = MOST // fields
-    return Batch(_BOOT, 0, range(n), {f"f{i}": [value] * n for i in range(fields)})
+    return Batch(BOOT, 0, range(n), {f"f{i}": [value] * n for i in range(fields)})
 
 
 @pytest.mark.parametrize(
@@ -234,12 +200,15 @@ def test_the_largest_allowed_number_of_values_is_read(fields, value):
 
 def test_the_longest_texts_are_read_with_any_characters():
     texts = ["," * 4096, '"' * 4096, "\\" * 4096, '\\"' * 2048, "[" * 4096, "{" * 4096, "é" * 4096]
-    batch = Batch(_BOOT, 0, range(7 * 20), {"a": texts * 20})
+    batch = Batch(BOOT, 0, range(7 * 20), {"a": texts * 20})
     assert decode_batch(encode_batch(batch)).columns == batch.columns
 
 
 def test_columns_with_extra_spaces_are_read():
-    columns = {"dt": [0] + [1] * 9_999, "fields": {"a.b": [0.5] * 10_000, "c": ["x", None] * 5_000}}
+    columns = {
+        "dt": [0] + [1] * 9_999,
+        "fields": {"a.b": [None, *[0.5] * 10_000], "c": [None, *["x", None] * 5_000]},
+    }
     body = json.dumps(columns, separators=("," + " " * 9, ": ")).encode()
     assert len(body) > 2 * MOST
     assert len(decode_batch(enveloped(body, 10_000)).times_us) == 10_000
@@ -252,7 +221,7 @@ def test_columns_with_extra_spaces_are_read():
 def test_encoder_and_decoder_refuse_too_many_values(samples, fields):
     said = f"at most {MOST} values, got {samples} samples of {fields} fields"
     with pytest.raises(ContractError, match=said):
-        encode_batch(Batch(_BOOT, 0, range(samples), {f"f{i}": [1] * samples for i in range(fields)}))
+        encode_batch(Batch(BOOT, 0, range(samples), {f"f{i}": [1] * samples for i in range(fields)}))
     columns = b",".join(b'"f%d":[%s0]' % (i, b"0," * (samples - 1)) for i in range(fields))
     body = b'{"dt":[0%s],"fields":{%s}}' % (b",1" * (samples - 1), columns)
     with pytest.raises(ContractError, match=said):
@@ -285,17 +254,10 @@ def test_an_expensive_body_is_refused_before_it_is_parsed(body):
 
 def test_a_field_name_has_at_most_1024_characters():
     longest = "a" + ".b" * 511 + "c"
-    batch = Batch(_BOOT, 0, [0], {longest: [1]})
+    batch = Batch(BOOT, 0, [0], {longest: [1]})
     assert decode_batch(encode_batch(batch)) == batch
     for name in (longest + "d", "a" + ".b" * 1_000_000):
         with pytest.raises(ContractError, match="at most 1024 characters"):
-            encode_batch(Batch(_BOOT, 0, [0], {name: [1]}))
+            encode_batch(Batch(BOOT, 0, [0], {name: [1]}))
         with pytest.raises(ContractError, match="at most 1024 characters"):
             decode_batch(enveloped(b'{"dt":[0],"fields":{"%s":[1]}}' % name.encode(), 1))
-
-
-def enveloped(body, n):
-    """A valid envelope with any body, in the codec that stores plain values."""
-    good = json.loads(encode_batch(Batch(_BOOT, 0, [0], {"a": [1]})))
-    packed = base64.b64encode(zlib.compress(body)).decode()
-    return {**good, "n": n, "codec": PLAIN_CODEC, "samples": packed}
