@@ -23,7 +23,7 @@ from functions.shared.analysis import NOT_COMPARED, Kept, failed_plans
 from functions.shared.clients import variables
 from functions.shared.recordings import Recordings
 from iort_analysis.drives.drive import Motion, motion_among
-from iort_analysis.drives.stretches import STAND_US, Found, Heard, find
+from iort_analysis.drives.stretches import STAND_US, Heard, Stretch, find
 from iort_analysis.samples.batches import Item, RefusedItems, blocks
 from iort_contract.catalog.environments import PlanEnvironment
 from iort_contract.cloud import plan_key, robots_key, waiting_key
@@ -95,7 +95,7 @@ class _Heard:
         self._recordings, self._robot, self._stream, self._motion = recordings, robot, stream, motion
         self._refused = RefusedItems()
 
-    def drives(self, request: AnalysisRequest) -> list[Found]:
+    def drives(self, request: AnalysisRequest) -> list[Stretch]:
         """The drives that have samples in the range."""
         batches = self.between(self.beginning_us(request.start_us), _END_US)
         return [one for one in find(batches, request.end_us) if one.last_us >= request.start_us]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iort_analysis.statistics.distributions import sides, tail
+from iort_analysis.statistics.signals import Array
 from iort_contract.messages.analysis import Estimate
 
 # How many drives the catalogue's word on a healthy car's spread is worth.
@@ -77,7 +77,7 @@ def baseline(estimates: Sequence[Estimate], expected_spread: float) -> Baseline:
     )
 
 
-def _between(values: NDArray[np.float64], errors: NDArray[np.float64]) -> float:
+def _between(values: Array, errors: Array) -> float:
     """The variance by which values differ beyond their errors (DerSimonian and Laird)."""
     weights = errors**-2.0
     off = values - np.average(values, weights=weights)

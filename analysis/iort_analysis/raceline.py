@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iort_analysis import AnalysisError
 from iort_analysis.statistics import quadratic
+from iort_analysis.statistics.signals import Array
 from iort_contract.track import Track
 
 # The distance of points, as a share of the track's width, and the limits of their number.
@@ -29,12 +29,12 @@ class Reference:
     """The centre line in points, an array of two columns in metres; the unit vectors to the left, and the
     bounds of the car's centre along them."""
 
-    points: NDArray[np.float64]
-    across: NDArray[np.float64]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    points: Array
+    across: Array
+    low: Array
+    high: Array
 
-    def line(self, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    def line(self, offset: Array) -> Array:
         """The points of a line by its offsets to the left."""
         return self.points + offset[:, None] * self.across
 
@@ -69,7 +69,7 @@ def reference(track: Track, car_width_m: float) -> Reference:
     return Reference(points, across, low, high)
 
 
-def curvature(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def curvature(points: Array) -> tuple[Array, Array]:
     """The curvature of a closed line at each point, 1/m and positive to the left, and the length that the
     point stands for."""
     ahead, behind = np.roll(points, -1, axis=0), np.roll(points, 1, axis=0)
@@ -78,13 +78,11 @@ def curvature(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
     return (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / length**3, length
 
 
-def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lengths(points: Array) -> Array:
     return np.asarray(np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1))
 
 
-def _hermite(
-    where: NDArray[np.float64], at: NDArray[np.float64], values: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _hermite(where: Array, at: Array, values: Array) -> Array:
     """Values of a closed line between its points, by cubics with the slope of their neighbours."""
     n = values.size
     i = np.clip(np.searchsorted(at, where, side="right") - 1, 0, n - 1)
@@ -102,7 +100,7 @@ def _hermite(
     )
 
 
-def _smoothed(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smoothed(points: Array) -> Array:
     """A closed line, smoothed by a bell of `_SMOOTH` points."""
     waves = np.fft.rfftfreq(points.shape[0])
     bell = np.exp(-2 * (np.pi * _SMOOTH * waves) ** 2)
@@ -121,7 +119,7 @@ _STEPS, _ENOUGH, _HALVES = 40, 1e-6, 12
 _RIDGE = 1e-7
 
 
-def least_curvature(track: Reference) -> NDArray[np.float64]:
+def least_curvature(track: Reference) -> Array:
     """The offsets to the left of the line of least curvature, in metres."""
     offset = np.clip(np.zeros_like(track.low), track.low, track.high)
     now = _cost(track, offset)
@@ -145,19 +143,19 @@ def least_curvature(track: Reference) -> NDArray[np.float64]:
     return offset
 
 
-def _cost(track: Reference, offset: NDArray[np.float64]) -> float:
+def _cost(track: Reference, offset: Array) -> float:
     """The integral of the squared curvature, 1/m."""
     residual = _residual(track.line(offset))
     return float(residual @ residual)
 
 
-def _residual(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _residual(points: Array) -> Array:
     """What squares and sums to the integral: the curvature times the root of the length."""
     first, second, length = _differences(points)
     return np.asarray(_cross(first, second) / length**2.5)
 
 
-def _linear(track: Reference, offset: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _linear(track: Reference, offset: Array) -> tuple[Array, Array]:
     """The residual, and its derivatives by the offset of the point behind, the point, and the one ahead."""
     first, second, length = _differences(track.line(offset))
     bend = _cross(first, second)
@@ -170,9 +168,7 @@ def _linear(track: Reference, offset: NDArray[np.float64]) -> tuple[NDArray[np.f
     return np.array(rows), bend / length**2.5
 
 
-def _normal(
-    rows: NDArray[np.float64], residual: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _normal(rows: Array, residual: Array) -> tuple[Array, Array]:
     """J^T J as `banded.solve` takes it, and J^T r, for a J of three cyclic diagonals."""
     behind, here, ahead = rows
     diagonals = np.array(
@@ -186,15 +182,13 @@ def _normal(
     return diagonals, gradient
 
 
-def _differences(
-    points: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _differences(points: Array) -> tuple[Array, Array, Array]:
     ahead, behind = np.roll(points, -1, axis=0), np.roll(points, 1, axis=0)
     first = (ahead - behind) / 2
     return first, ahead - 2 * points + behind, np.linalg.norm(first, axis=1)
 
 
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross(a: Array, b: Array) -> Array:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
@@ -238,15 +232,15 @@ class Profile:
     """Speeds along a closed line: at each point the way from the first one, the curvature, the speed, and
     the time since the first point."""
 
-    at_m: NDArray[np.float64]
-    curvature_1pm: NDArray[np.float64]
-    speed_mps: NDArray[np.float64]
-    time_s: NDArray[np.float64]
+    at_m: Array
+    curvature_1pm: Array
+    speed_mps: Array
+    time_s: Array
     length_m: float
     lap_s: float
 
 
-def profile(points: NDArray[np.float64], limits: Limits) -> Profile:
+def profile(points: Array, limits: Limits) -> Profile:
     """The fastest profile of a lap after a lap: the speed at the end is that at the start.
 
     Raises `LimitsError`.
@@ -293,9 +287,7 @@ def _forward(most: list[float], bend: list[float], steps: list[float], limits: L
     return speed
 
 
-def _backward(
-    most: list[float], bend: list[float], steps: list[float], limits: Limits
-) -> NDArray[np.float64]:
+def _backward(most: list[float], bend: list[float], steps: list[float], limits: Limits) -> Array:
     speed = list(most)
     for i in range(len(speed) - 1, -1, -1):
         after = speed[(i + 1) % len(speed)]

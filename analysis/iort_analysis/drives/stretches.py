@@ -38,7 +38,7 @@ class Heard(NamedTuple):
     moves: Callable[[], bool]
 
 
-class Found(NamedTuple):
+class Stretch(NamedTuple):
     """A drive: its first and last batch start at these times, in one run."""
 
     start_us: int
@@ -46,7 +46,7 @@ class Found(NamedTuple):
     run: str
 
 
-def find(batches: Iterable[Heard], until_us: int | None = None) -> Iterator[Found]:
+def find(batches: Iterable[Heard], until_us: int | None = None) -> Iterator[Stretch]:
     """The drives in batches in order of time, that begin before ``until_us``.
 
     A drive begins with the run or some seconds before the car moves, and ends alike. Runs that recorded at
@@ -57,7 +57,7 @@ def find(batches: Iterable[Heard], until_us: int | None = None) -> Iterator[Foun
             yield found
 
 
-def _find(batches: Iterable[Heard], until_us: int | None) -> Iterator[Found]:
+def _find(batches: Iterable[Heard], until_us: int | None) -> Iterator[Stretch]:
     runs: dict[str, _Run] = {}
     for batch in batches:
         for boot, run in list(runs.items()):
@@ -91,7 +91,7 @@ class _Run:
         """Whether a drive goes on that began before a time."""
         return self._start_us is not None and self._start_us < t_us
 
-    def hear(self, batch: Heard) -> Iterator[Found]:
+    def hear(self, batch: Heard) -> Iterator[Stretch]:
         """Take the next batch; yields the drive that a stand has just ended."""
         self.newest_us = batch.id.t_us
         apart = _LOOK_MOVING_US if self._moving else _LOOK_STANDING_US
@@ -100,14 +100,14 @@ class _Run:
             return
         yield from self._look(batch)
 
-    def ended(self) -> Iterator[Found]:
+    def ended(self) -> Iterator[Stretch]:
         """The drive at the run's end, if there is one."""
         if self._unseen:
             yield from self._look(self._unseen.pop())
         if self._start_us is not None:
             yield self._drive()
 
-    def _look(self, batch: Heard) -> Iterator[Found]:
+    def _look(self, batch: Heard) -> Iterator[Stretch]:
         moves, unseen = batch.moves(), self._unseen
         self._looked_us, self._unseen = batch.id.t_us, []
         if moves:
@@ -122,7 +122,7 @@ class _Run:
             self._moved_us = batch.id.t_us
             cut_us = (-(-self._start_us // LONGEST_US) + 1) * LONGEST_US
             if cut_us <= self._moved_us:
-                yield Found(self._start_us, cut_us - MAX_BATCH_SPAN_US, self._boot)
+                yield Stretch(self._start_us, cut_us - MAX_BATCH_SPAN_US, self._boot)
                 self._start_us = cut_us
         elif self._moving:
             last = next((one.id.t_us for one in reversed(unseen) if one.moves()), None)
@@ -132,10 +132,10 @@ class _Run:
             yield self._drive()
             self._start_us = None
 
-    def _drive(self) -> Found:
+    def _drive(self) -> Stretch:
         assert self._start_us is not None
         last_us = min(self.newest_us, self._moved_us + _AROUND_US)
-        found = Found(self._start_us, last_us, self._boot)
+        found = Stretch(self._start_us, last_us, self._boot)
         # What belongs to this drive is not the beginning of the next one.
         self._earliest_us = last_us + 1
         return found

@@ -6,7 +6,6 @@ import math
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iort_analysis.statistics.signals import Array, quantum
 from iort_contract.messages.analysis import INTERVAL
@@ -100,7 +99,7 @@ def sides(freedom: float = math.inf) -> float:
     return quantile((1 + INTERVAL) / 2, freedom)
 
 
-def mean_of(values: NDArray[np.float64]) -> tuple[float, float, float]:
+def mean_of(values: Array) -> tuple[float, float, float]:
     """The mean of at least two values, and its interval: at least the step in which they are reported."""
     mean, n = float(values.mean()), len(values)
     either = sides(n - 1) * float(values.std(ddof=1)) / math.sqrt(n)

@@ -8,11 +8,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_analysis.statistics.signals import Array
+
 # A block has to hold the band; larger ones spend more on arithmetic and less on calls.
 _BLOCK = 24
 
 
-def solve(diagonals: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+def solve(diagonals: Array, right: Array) -> Array:
     """The solution x of A x = right, for a symmetric positive definite A of five cyclic diagonals.
 
     ``diagonals[k, i]`` is A[i, (i + k) % n] for k = 0, 1, 2. The unknowns are cut into blocks. The last one
@@ -48,7 +50,7 @@ def solve(diagonals: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray
     return np.concatenate([*(solved[:, 0] - solved[:, 1:] @ end for solved in sides), end])
 
 
-def product(diagonals: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+def product(diagonals: Array, x: Array) -> Array:
     """A x, for the same A."""
     total = diagonals[0] * x
     for k in (1, 2):
@@ -56,9 +58,7 @@ def product(diagonals: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[n
     return np.asarray(total)
 
 
-def _part(
-    diagonals: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _part(diagonals: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Array:
     """A[rows][:, columns]."""
     n = diagonals.shape[1]
     apart = (columns[None, :] - rows[:, None]) % n
@@ -77,12 +77,7 @@ _STEPS, _ENOUGH = 60, 1e-8
 _SHARE = 0.995
 
 
-def minimum(
-    hessian: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def minimum(hessian: Array, gradient: Array, low: Array, high: Array) -> Array:
     """The x from low to high with the least x H x / 2 + gradient x, for H as `solve` takes it."""
     x = (low + high) / 2
     scale = max(float(np.abs(gradient).max()), 1e-12)
@@ -104,7 +99,7 @@ def minimum(
 
 
 # How x and both multipliers move.
-_Step = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+_Step = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -112,19 +107,19 @@ class _Iterate:
     """A point strictly within its bounds: its distances from them, their multipliers, and the slope of the
     Lagrangian."""
 
-    hessian: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    below: NDArray[np.float64]
-    above: NDArray[np.float64]
-    z_below: NDArray[np.float64]
-    z_above: NDArray[np.float64]
+    hessian: Array
+    slope: Array
+    below: Array
+    above: Array
+    z_below: Array
+    z_above: Array
 
     @property
     def gap(self) -> float:
         """The mean product of a distance and its multiplier: 0 at the solution."""
         return float(self.below @ self.z_below + self.above @ self.z_above) / (2 * self.below.size)
 
-    def step(self, to_below: NDArray[np.float64], to_above: NDArray[np.float64]) -> _Step:
+    def step(self, to_below: Array, to_above: Array) -> _Step:
         """Newton's step to these products of distances and multipliers."""
         system = self.hessian.copy()
         system[0] += self.z_below / self.below + self.z_above / self.above

@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_analysis.drives.stretches import LONGEST_US, Found, Heard, find
+from iort_analysis.drives.stretches import LONGEST_US, Heard, Stretch, find
 from iort_contract.messages.batch import BatchId
 
 START_US, S = 1_700_000_000_000_000, 1_000_000
@@ -28,7 +28,7 @@ def parts(*lengths: int) -> list[bool]:
     return [i % 2 == 1 for i, length in enumerate(lengths) for _ in range(length)]
 
 
-def in_seconds(found: Sequence[Found]) -> list[tuple[float, float, str]]:
+def in_seconds(found: Sequence[Stretch]) -> list[tuple[float, float, str]]:
     return [((one.start_us - START_US) / S, (one.last_us - START_US) / S, one.run) for one in found]
 
 

@@ -77,8 +77,8 @@ def test_a_drive_in_any_state_has_a_result() -> None:
         )
 
 
-def test_an_hour_takes_a_fraction_of_a_second() -> None:
-    """180,000 samples; the miners have the rest of the two seconds."""
+def test_an_hour_takes_seconds() -> None:
+    """180,000 samples of the controller; the cleaning and the miner that reads the most."""
     hour = {
         name: Block(
             np.concatenate([block.times_us + i * 600_000_000 for i in range(6)]),
@@ -87,11 +87,11 @@ def test_an_hour_takes_a_fraction_of_a_second() -> None:
         for name, block in streams(600).items()
     }
     before = time.process_time()
-    result = analyse(KEY, hour, VEHICLE, miners={})
+    result = analyse(KEY, hour, VEHICLE, miners={"anomalies": MINERS["anomalies"]})
     took_s = time.process_time() - before
 
     assert result.samples == 270_000
-    assert took_s < 1
+    assert took_s < 2
 
 
 def test_wild_values_are_repaired_and_named_where_they_are_too_many() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from functools import cache
 
 import numpy as np
@@ -230,18 +229,3 @@ def test_a_short_drive_says_so(samples: int) -> None:
     assert not found.estimates
     assert not found.events
     assert "the drive must last 60 s" in found.missing["anomalies"]
-
-
-def test_an_hour_takes_less_than_a_second() -> None:
-    drive = driven()[0]
-    hours = {}
-    for name, block in drive.raw.items():
-        n, length = 15, drive.end_us - drive.key.start_us + 20_000
-        times = np.concatenate([block.times_us + i * length for i in range(n)])
-        hours[name] = Block(times, {field: np.tile(c, n) for field, c in block.columns.items()})
-    hour = build(drive.key, hours)
-    assert len(hour.samples.times_us) >= 180_000
-    began = time.process_time()
-    with np.errstate(all="ignore"):
-        anomalies.mine(hour)
-    assert time.process_time() - began < 1.0
