@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Mapping
 
 from iort_contract.catalog.entries import Field, Stream
@@ -20,18 +21,13 @@ VESC_STREAM = "vesc"
 TACHOMETER_COUNTS = 6
 # The fields behind alert mails.
 FAULT_FIELD, VOLTAGE_FIELD = "fault_code", "voltage_input"
+# Of the drivers of ROS 1 and ROS 2, or of ROS 2 alone.
+_both, _ros2 = partial(Field, ros=(1, 2)), partial(Field, ros=(2,))
 VESC = Stream(
     VESC_STREAM,
     "the state of a VESC motor controller",
     (
-        Field(
-            VOLTAGE_FIELD,
-            "V",
-            "battery voltage at the controller",
-            "battery",
-            (1, 2),
-            label="Battery voltage",
-        ),
+        _both(VOLTAGE_FIELD, "V", "battery voltage at the controller", "battery", label="Battery voltage"),
         Field(
             "temperature_pcb",
             "degC",
@@ -40,42 +36,34 @@ VESC = Stream(
             (1,),
             label="Board temperature",
         ),
-        Field("temp_fet", "degC", "temperature of the MOSFETs (driver may leave 0)", "temperature", (2,)),
-        Field("temp_motor", "degC", "temperature of the motor (driver may leave 0)", "temperature", (2,)),
-        Field(
-            "current_motor",
-            "A",
-            "motor current, negative while braking",
-            "motor",
-            (1, 2),
-            label="Motor current",
-        ),
-        Field(
+        _ros2("temp_fet", "degC", "temperature of the MOSFETs (driver may leave 0)", "temperature"),
+        _ros2("temp_motor", "degC", "temperature of the motor (driver may leave 0)", "temperature"),
+        _both("current_motor", "A", "motor current, negative while braking", "motor", label="Motor current"),
+        _both(
             "current_input",
             "A",
             "battery current, negative while regenerating",
             "battery",
-            (1, 2),
             label="Battery current",
         ),
-        Field("avg_id", "A", "direct-axis current", "motor", (2,)),
-        Field("avg_iq", "A", "quadrature-axis current", "motor", (2,)),
-        Field("speed", "erpm", "electrical speed of the motor, revolutions per minute", "motion", (1, 2)),
-        Field("duty_cycle", "1", "share of the battery voltage on the motor, -1 to 1", "motor", (1, 2)),
-        Field("charge_drawn", "1e-4 Ah", "charge drawn since power-on", "battery", (1, 2), "Ah"),
-        Field("charge_regen", "1e-4 Ah", "charge recovered since power-on", "battery", (1, 2), "Ah"),
-        Field("energy_drawn", "1e-4 Wh", "energy drawn since power-on", "battery", (1, 2), "Wh"),
-        Field("energy_regen", "1e-4 Wh", "energy recovered since power-on", "battery", (1, 2), "Wh"),
-        Field("displacement", "counts", "tachometer, net", "motion", (1, 2)),
-        Field("distance_traveled", "counts", "tachometer, absolute", "motion", (1, 2)),
-        Field(FAULT_FIELD, "enum", "0 none, otherwise see FAULTS", "state", (1, 2)),
-        Field("pid_pos_now", "deg", "rotor position of the position controller", "motion", (2,)),
-        Field("controller_id", "id", "CAN id of the controller", "state", (2,)),
-        Field("ntc_temp_mos1", "degC", "temperature of MOSFET 1", "temperature", (2,)),
-        Field("ntc_temp_mos2", "degC", "temperature of MOSFET 2", "temperature", (2,)),
-        Field("ntc_temp_mos3", "degC", "temperature of MOSFET 3", "temperature", (2,)),
-        Field("avg_vd", "V", "direct-axis voltage", "motor", (2,)),
-        Field("avg_vq", "V", "quadrature-axis voltage", "motor", (2,)),
+        _ros2("avg_id", "A", "direct-axis current", "motor"),
+        _ros2("avg_iq", "A", "quadrature-axis current", "motor"),
+        _both("speed", "erpm", "electrical speed of the motor, revolutions per minute", "motion"),
+        _both("duty_cycle", "1", "share of the battery voltage on the motor, -1 to 1", "motor"),
+        _both("charge_drawn", "1e-4 Ah", "charge drawn since power-on", "battery", ros2_unit="Ah"),
+        _both("charge_regen", "1e-4 Ah", "charge recovered since power-on", "battery", ros2_unit="Ah"),
+        _both("energy_drawn", "1e-4 Wh", "energy drawn since power-on", "battery", ros2_unit="Wh"),
+        _both("energy_regen", "1e-4 Wh", "energy recovered since power-on", "battery", ros2_unit="Wh"),
+        _both("displacement", "counts", "tachometer, net", "motion"),
+        _both("distance_traveled", "counts", "tachometer, absolute", "motion"),
+        _both(FAULT_FIELD, "enum", "0 none, otherwise see FAULTS", "state"),
+        _ros2("pid_pos_now", "deg", "rotor position of the position controller", "motion"),
+        _ros2("controller_id", "id", "CAN id of the controller", "state"),
+        _ros2("ntc_temp_mos1", "degC", "temperature of MOSFET 1", "temperature"),
+        _ros2("ntc_temp_mos2", "degC", "temperature of MOSFET 2", "temperature"),
+        _ros2("ntc_temp_mos3", "degC", "temperature of MOSFET 3", "temperature"),
+        _ros2("avg_vd", "V", "direct-axis voltage", "motor"),
+        _ros2("avg_vq", "V", "quadrature-axis voltage", "motor"),
     ),
 )
 VESC_FIELDS = {field.name: field for field in VESC.fields}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 from dataclasses import replace
@@ -50,7 +49,7 @@ from iort_contract.messages.questions import (
     unpacked_samples,
 )
 from tests.examples import examples
-from tests.unit.contract.contract_values import DEEP, GOOD, GOOD_LIVE, batches, decode_or_refuse, json_values
+from tests.unit.contract.contract_values import DEEP, GOOD, GOOD_LIVE, decode_or_refuse
 
 T0 = 1_700_000_000_000_000
 MESSAGES = st.dictionaries(
@@ -61,7 +60,6 @@ MESSAGES = st.dictionaries(
     | st.lists(st.none(), max_size=2),
     max_size=4,
 )
-KEYS = ["v", "session", "started_us", "seq", "sent_us", "valid_ms", "lease_ms", "message", "boot"]
 TIMES = st.integers(0, 2**53 - 1)
 
 
@@ -112,17 +110,6 @@ def test_an_invalid_fleet_message_is_refused(change: dict[str, Any]) -> None:
     if "v" not in change:
         with pytest.raises(ContractError):
             encode_fleet(replace(good, **change))
-
-
-ANYTHING = st.none() | st.booleans() | st.integers(-1, 2) | st.floats() | st.text(max_size=9) | st.just({})
-
-
-@given(st.dictionaries(st.sampled_from(KEYS), ANYTHING) | st.binary(max_size=40))
-def test_any_other_input_raises_the_contracts_error(content: Any) -> None:
-    payload = content if isinstance(content, bytes) else json.dumps(content).encode()
-    for read in (decode_command, decode_fleet):
-        with pytest.raises(ContractError):
-            read(payload)
 
 
 # Query messages are decoded as they were encoded; invalid ones are refused.
@@ -196,83 +183,25 @@ def test_samples_are_unpacked_as_they_were_packed() -> None:
         unpacked_samples(SAMPLES[:-3])
 
 
-# Every decoder accepts a valid message and raises `ContractError` for any other input.
+# What every decoder of messages refuses; tests/unit/analysis/test_decoders.py damages valid ones.
 
 DECODERS = [decode_batch, decode_live, decode_pong]
-decoders = st.sampled_from(DECODERS)
-
-
 # Values of boto3 and Python that JSON does not have.
-python_values = json_values | st.decimals() | st.binary(max_size=8) | st.sets(st.integers(), max_size=2)
 awkward = st.sampled_from(
     [
-        Decimal("NaN"),
-        Decimal("sNaN"),
-        Decimal("Infinity"),
-        Decimal("1E+125"),
-        Decimal("1E+999999999999"),
-        Decimal("1E-130"),
-        Decimal("1.0"),
-        Decimal("-0"),
-        10**5000,
-        2**53,
-        2**63,
-        1e308,
-        math.nan,
-        math.inf,
-        -0.0,
-        "",
-        "1",
-        b"1",
-        bytearray(b"1"),
-        (),
-        "\ud800",
-        object(),
+        *map(Decimal, ("NaN", "sNaN", "Infinity", "1E+999999999999", "1.0", "-0")),
+        *(10**5000, b"1", bytearray(b"1"), (), object(), math.nan, "\ud800"),
     ]
 )
 
 
-def envelopes():
-    return st.sampled_from([encode_batch(GOOD), encode_live(GOOD_LIVE)]).map(json.loads)
-
-
-@given(decoders, st.binary(max_size=200))
-def test_any_bytes_are_decoded_or_refused(decoder, message):
-    decode_or_refuse(decoder, message)
-
-
-@given(decoders, st.text(st.characters(), max_size=200))
-def test_any_text_is_decoded_or_refused(decoder, message):
-    decode_or_refuse(decoder, message)
-
-
-@given(decoders, json_values)
-def test_any_json_is_decoded_or_refused(decoder, value):
-    decode_or_refuse(decoder, json.dumps(value))
-    decode_or_refuse(decoder, json.dumps(value).encode("utf-16"))
-
-
-@given(st.sampled_from(DECODERS[:2]), st.dictionaries(st.text(max_size=4), python_values, max_size=4))
-def test_any_table_item_is_decoded_or_refused(decoder, item):
-    decode_or_refuse(decoder, item)
-
-
-@examples(300)
-@given(st.data(), python_values | awkward)
-def test_a_message_with_one_key_replaced_is_decoded_or_refused(data, value):
-    envelope = data.draw(envelopes())
+@examples(200)
+@given(st.sampled_from([encode_batch(GOOD), encode_live(GOOD_LIVE)]), st.data(), awkward)
+def test_a_message_with_an_awkward_value_is_decoded_or_refused(message, data, value):
+    envelope = json.loads(message)
     envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
     for decoder in DECODERS[:2]:
         decode_or_refuse(decoder, envelope)
-
-
-@examples(200)
-@given(st.data(), json_values)
-def test_a_text_with_one_key_replaced_is_decoded_or_refused(data, value):
-    envelope = data.draw(envelopes())
-    envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
-    for decoder in DECODERS:
-        decode_or_refuse(decoder, json.dumps(envelope))
 
 
 @pytest.mark.parametrize("good", [encode_batch(GOOD), encode_live(GOOD_LIVE)], ids=["batch", "live"])
@@ -283,26 +212,6 @@ def test_a_message_with_one_key_removed_is_decoded_or_refused(good):
         del envelope[key]
         with pytest.raises(ContractError, match=key):
             decoder(json.dumps(envelope))
-
-
-@examples(300)
-@given(batches(), st.data())
-def test_a_damaged_message_is_decoded_or_refused(batch, data):
-    message = bytearray(encode_batch(batch))
-    at = data.draw(st.integers(0, len(message) - 1))
-    message[at] = data.draw(st.integers(0, 255))
-    decode_or_refuse(decode_batch, bytes(message))
-    decode_or_refuse(decode_batch, bytes(message[:at]))
-
-
-@examples(200)
-@given(st.data())
-def test_damaged_compressed_samples_are_decoded_or_refused(data):
-    envelope = json.loads(encode_batch(GOOD))
-    packed = bytearray(base64.b64decode(envelope["samples"]))
-    at = data.draw(st.integers(0, len(packed) - 1))
-    packed[at] ^= data.draw(st.integers(1, 255))
-    decode_or_refuse(decode_batch, dict(envelope, samples=base64.b64encode(packed).decode()))
 
 
 @pytest.mark.parametrize("decoder", DECODERS)
@@ -334,10 +243,6 @@ def test_the_error_for_a_long_value_is_short():
     with pytest.raises(ContractError) as caught:
         decode_batch(dict(json.loads(encode_batch(GOOD)), codec="x" * 10_000))
     assert len(str(caught.value)) < 200
-
-
-def test_the_contracts_error_is_a_value_error():
-    assert issubclass(ContractError, ValueError)
 
 
 # Findings survive JSON, and anything else is refused.
@@ -375,10 +280,6 @@ def test_a_finding_survives_json() -> None:
 def test_what_is_no_finding_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(ContractError):
         decode_finding({**encode_finding(FINDING), **change})
-
-
-def test_a_whole_number_is_a_float_too() -> None:
-    assert repr(decode_finding({**encode_finding(FINDING), "p": 0}).p) == "0.0"
 
 
 def test_every_parameter_names_a_kind_that_exists() -> None:
