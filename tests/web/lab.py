@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from typing import NamedTuple
@@ -11,12 +12,15 @@ from iort_contract.catalog.metrics import METRICS, alarm_of
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.commands import NO_MOTION
 from iort_station.errors import StationError
+from iort_station.page import insights as analysis
+from tests.unit.station.data.test_queries import START
+from tests.unit.station.data.test_runs import driven_cloud
 from tests.web.cars import GAIN, SAMPLE
 
 _DAY_US = 86_400_000_000
-_NEWEST_US = round(time.time() - 3600) * 1_000_000
-_LAP_S = 12.0
-_PLACES = 200
+# The drive of laps that the newest drive is.
+END = START + 90_000_000
+_driven = functools.cache(driven_cloud)
 
 
 def _estimate(value, either, unit):
@@ -24,24 +28,18 @@ def _estimate(value, either, unit):
 
 
 def drive(days_ago, *, failed="", robot="car-1"):
-    start_us = _NEWEST_US - days_ago * _DAY_US
+    start_us = START - days_ago * _DAY_US
     grown = 0.04 + 0.003 * max(0, 5 - days_ago)
-    return {
-        "robot": robot,
-        "from_us": start_us,
-        "to_us": start_us + 600_000_000,
-        "samples": 42_000,
-        "failed": failed,
-        "repairs": {"outlier": 12, "gap": 1},
-        "estimates": {}
-        if failed
-        else {
-            "battery_resistance_ohm": _estimate(grown, 0.002, "ohm"),
-            "lap_best_s": _estimate(11.3 + 0.1 * math.sin(days_ago), 0.01, "s"),
-            "lap_mean_s": _estimate(12 + 0.1 * math.sin(days_ago), 0.2, "s"),
-        },
-        "missing": {} if failed else {"lap_energy_wh": "needs voltage and current of the battery"},
+    estimates = {
+        "battery_resistance_ohm": _estimate(grown, 0.002, "ohm"),
+        "lap_best_s": _estimate(11.3 + 0.1 * math.sin(days_ago), 0.01, "s"),
+        "lap_mean_s": _estimate(12 + 0.1 * math.sin(days_ago), 0.2, "s"),
     }
+    missing = {"lap_energy_wh": "needs voltage and current of the battery"}
+    known = {} if failed else {"estimates": estimates, "missing": missing}
+    times = {"from_us": start_us, "to_us": start_us + END - START}
+    more = {"samples": 4500, "failed": failed, "repairs": {"outlier": 12, "gap": 1}}
+    return {"robot": robot, **times, **more, "estimates": {}, "missing": {}, **known}
 
 
 def finding(kind, **given):
@@ -49,9 +47,9 @@ def finding(kind, **given):
     return {
         "id": kind,
         "robot": "car-1",
-        "start_us": _NEWEST_US,
-        "from_us": _NEWEST_US + 60_000_000,
-        "to_us": _NEWEST_US + 90_000_000,
+        "start_us": START,
+        "from_us": START + 60_000_000,
+        "to_us": START + 90_000_000,
         "kind": kind,
         "severity": entry.severity,
         "meaning": entry.meaning,
@@ -83,42 +81,9 @@ def insights(asked):
     return {"findings": findings, "drives": [*drives, failed], "groups": groups}
 
 
-def laps(asked):
-    start_us = int(asked["from_us"])
-    times = [_LAP_S + 0.3 * math.sin(i) for i in range(9)]
-    return {
-        "laps": [
-            {
-                "lap": i + 1,
-                "from_us": start_us + round(sum(times[:i]) * 1e6),
-                "to_us": start_us + round(sum(times[: i + 1]) * 1e6),
-                "time_s": time_s,
-                "distance_m": 47.5,
-                "energy_wh": 0.06,
-                "energy_wh_per_km": 1.27,
-                "mean_speed_mps": 47.5 / time_s,
-                "top_speed_mps": 6.5,
-                "complete": i != 3,
-                "best": time_s == min(times),
-            }
-            for i, time_s in enumerate(times)
-        ],
-        "method": "gate",
-        "confidence": 0.89,
-        "reason": "",
-        "estimates": {"lap_best_s": _estimate(min(times), 0.004, "s"), "lap_mean_s": _estimate(12, 0.1, "s")},
-    }
-
-
-def delta(asked):
-    shares = [i / _PLACES for i in range(_PLACES + 1)]
-    return {
-        "places": [47.5 * share for share in shares],
-        "unit": "m",
-        "delta_s": [int(asked["other"]) / 50 * share + 0.05 * math.sin(9 * share) for share in shares],
-        "one_mps": [4 + 2 * math.cos(12 * share) for share in shares],
-        "other_mps": [4 + 1.9 * math.cos(12 * share + 0.1) for share in shares],
-    }
+def of_laps(answer):
+    """The server's own answer of the drive's laps."""
+    return lambda asked: answer(_driven(), {**asked, "robot": "car"})
 
 
 class View(NamedTuple):
@@ -146,7 +111,20 @@ VIEWS = {
 TRACEBACK = """[ERROR] ValueError: the gain of car-7 must not be 0
   File "/var/task/functions/live.py", line 61, in handler
     publish(event)"""
+LOG = {
+    "columns": ["@timestamp", "@log", "@message"],
+    "rows": [["2026-05-04 10:00:00.123", "123456789012:/aws/lambda/live", TRACEBACK]],
+}
 NOW_S = time.time()
+REJECTED = {
+    "id": "0a1b2c",
+    "robot": "car-1",
+    "source": "stream",
+    "topic": "record/iort/car-1/vesc",
+    "reason": "column speed must have 10 values, got 9",
+    "last_s": NOW_S - 300,
+    "seen": 2,
+}
 WHY_NOT = f"a stop does nothing there: {NO_MOTION}"
 _LONG = "a_field_" + "x" * 99
 
@@ -181,14 +159,8 @@ SETTINGS = [
 ]
 
 
-LIMITS = {
-    "command": "drive",
-    "speed": "drive.speed",
-    "steering": "drive.steering_angle",
-    "max_speed_mps": 2.0,
-    "max_steering_rad": 0.4,
-    "lease_ms": 500,
-}
+LIMITS = {"command": "drive", "speed": "drive.speed", "steering": "drive.steering_angle"}
+LIMITS |= {"max_speed_mps": 2.0, "max_steering_rad": 0.4, "lease_ms": 500}
 
 
 class Lab:
@@ -226,10 +198,7 @@ class Lab:
     def acknowledge(self, asked):
         self.asked.append(dict(asked))
         seen = {"by": asked["by"] or "operator@lab", "at_s": time.time()}
-        self.alarms = [
-            alarm(**{**one, "acknowledged": seen}) if one["key"] == asked["alarm"] else one
-            for one in self.alarms
-        ]
+        next(entry for entry in self.alarms if entry["key"] == asked["alarm"])["acknowledged"] = seen
         return seen
 
     def write(self, asked):
@@ -244,23 +213,23 @@ class Lab:
         return {"notes": self.notes}
 
     def motion(self, asked):
-        cars = {
-            name: {
-                "asked": told and name not in self.unstoppable,
-                "stopped": stands and name not in self.unstoppable,
-                "reason": NO_MOTION if told and name in self.unstoppable else "",
-                "stands": stands and name not in self.unstoppable,
-                "stoppable": name not in self.unstoppable,
-                "why_not": WHY_NOT if name in self.unstoppable else "",
-                "alone": told and name in self.alone,
-                "by": "operator@lab" if told else "",
-                "at_ms": round(NOW_S * 1000) if told else 0,
-                "drive": LIMITS if name == "car-1" else None,
-            }
-            for name, (told, stands) in self.cars.items()
-            if asked.get("robot", name) == name
+        names = [name for name in self.cars if asked.get("robot", name) == name]
+        return {"robots": {name: self._entry(name) for name in names}, "user": "operator@lab", "failed": {}}
+
+    def _entry(self, name):
+        (told, stands), able = self.cars[name], name not in self.unstoppable
+        return {
+            "asked": told and able,
+            "stopped": stands and able,
+            "stands": stands and able,
+            "stoppable": able,
+            "why_not": "" if able else WHY_NOT,
+            "reason": NO_MOTION if told and not able else "",
+            "alone": told and name in self.alone,
+            "by": "operator@lab" if told else "",
+            "at_ms": round(NOW_S * 1000) if told else 0,
+            "drive": LIMITS if name == "car-1" else None,
         }
-        return {"robots": cars, "user": "operator@lab", "failed": {}}
 
     def drive(self, _asked):
         raise StationError("the role of a driver cannot be assumed")
@@ -304,32 +273,13 @@ class Lab:
             "insights": insights,
             "notes": self.answer_notes,
             "motion": self.motion,
-            "laps": laps,
-            "delta": delta,
+            "laps": of_laps(analysis.laps),
+            "delta": of_laps(analysis.delta),
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},
             "dashboard": self.dashboard,
-            "log": lambda _: {
-                "columns": ["@timestamp", "@log", "@message"],
-                "rows": [["2026-05-04 10:00:00.123", "123456789012:/aws/lambda/live", TRACEBACK]],
-                "found": 1,
-                "from_s": 0,
-                "to_s": 60,
-            },
+            "log": lambda _: {**LOG, "found": 1, "from_s": 0, "to_s": 60},
             "alarms": self.answer_alarms,
-            "rejected": lambda _: {
-                "found": 1,
-                "rejected": [
-                    {
-                        "id": "0a1b2c",
-                        "robot": "car-1",
-                        "source": "stream",
-                        "topic": "record/iort/car-1/vesc",
-                        "reason": "column speed must have 10 values, got 9",
-                        "last_s": NOW_S - 300,
-                        "seen": 2,
-                    }
-                ],
-            },
+            "rejected": lambda _: {"found": 1, "rejected": [REJECTED]},
         }
 
     def dashboard(self, asked):
@@ -348,15 +298,11 @@ class Lab:
             },
             {"kind": "log", "title": "Newest warnings and errors"},
         ]
-        return {
-            "name": asked["name"],
-            "from_s": to_s - 3600,
-            "to_s": to_s,
-            "widgets": [
-                {"series": [], "alarms": [], **drawn, **widget, "number": i, "x": 0, "y": 5 * i}
-                for i, widget in enumerate(widgets)
-            ],
-        }
+        placed = [
+            {"series": [], "alarms": [], **drawn, **widget, "number": i, "x": 0, "y": 5 * i}
+            for i, widget in enumerate(widgets)
+        ]
+        return {"name": asked["name"], "from_s": to_s - 3600, "to_s": to_s, "widgets": placed}
 
 
 def runs():

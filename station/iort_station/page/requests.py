@@ -94,34 +94,15 @@ def whole(request: Mapping[str, str], name: str, least: int, most: int) -> int:
     return int(value)
 
 
-def answered(answer: Handler, parameters: Mapping[str, str]) -> tuple[int, Body] | Waiting:
-    """The answer, or what waits for it."""
-
-    def begun() -> tuple[int, Body] | Waiting:
-        result = answer(parameters)
-        return result if isinstance(result, Generator) else (200, as_json(result, level=1))
-
-    return tried(begun)
-
-
-def stepped(waiting: Waiting) -> tuple[int, Body] | None:
-    """The answer; None if it has yet to come."""
-
-    def step() -> tuple[int, Body] | None:
-        try:
-            next(waiting)
-        except StopIteration as end:
-            return 200, as_json(end.value, level=1)
-        return None
-
-    return tried(step)
-
-
-def tried(work: Callable[[], _T]) -> _T | tuple[int, Body]:
-    """The result, or the status and the body of its error."""
+def outcome(work: Callable[[], Mapping[str, Any] | _T]) -> tuple[int, Body] | _T:
+    """The status and the body of an answer or of an error; anything else as it is. A generator answers by its
+    end."""
     try:
-        return work()
+        result = work()
+    except StopIteration as end:
+        result = end.value
     except (StationError, ContractError) as error:
         return 400, as_json({"error": str(error)})
     except (BotoCoreError, ClientError) as error:
         return 502, as_json({"error": f"AWS refused a call: {error}"})
+    return (200, as_json(result, level=1)) if isinstance(result, Mapping) else result

@@ -20,6 +20,7 @@ import ssl
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import ExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -36,7 +37,7 @@ from iort_station.page.background import BackgroundServer
 from iort_station.page.invitations import COMMAND, answer, listening
 from iort_station.page.page import BUILT, DRIVE, TYPES, built_files, config
 from iort_station.page.places import ACTING, READING, WRITING, Busy, Work, client_of
-from iort_station.page.requests import Body, Handler, answered, as_json, packed, stepped, takes_gzip, tried
+from iort_station.page.requests import Body, Handler, as_json, outcome, packed, takes_gzip
 
 # Writes a file into a folder and returns it.
 Download = Callable[[Mapping[str, str], Path], Path]
@@ -216,10 +217,10 @@ class PageServer(BackgroundServer):
         """The answer, in a place of its lane; what yields waits without one."""
         client = client_of(request.remote or "")
         try:
-            result = await self._work.do(lambda: answered(answer, parameters), lane, client, path)
+            result = await self._work.do(lambda: outcome(lambda: answer(parameters)), lane, client, path)
             if not isinstance(result, tuple):
                 waiting = result
-                result = await self._work.until(lambda: stepped(waiting), lane, client, path)
+                result = await self._work.until(lambda: outcome(lambda: next(waiting)), lane, client, path)
         except Busy as busy:
             return self._busy(request, busy)
         return self._response(request, result[1], result[0])
@@ -228,23 +229,16 @@ class PageServer(BackgroundServer):
         parameters, download = dict(request.query), self._downloads[path]
         with TemporaryDirectory(prefix="iort-download-") as folder:
             try:
-                written = await self._work.do(
-                    lambda: tried(lambda: download(parameters, Path(folder))),
-                    WRITING,
-                    client_of(request.remote or ""),
-                    path,
-                )
+                client = client_of(request.remote or "")
+                work = partial(download, parameters, Path(folder))
+                written = await self._work.do(lambda: outcome(work), WRITING, client, path)
             except Busy as busy:
                 return self._busy(request, busy)
             if isinstance(written, tuple):
                 return self._response(request, written[1], written[0])
-            response = web.StreamResponse(
-                headers={
-                    **self._headers,
-                    "Content-Type": "application/octet-stream",
-                    "Content-Disposition": f'attachment; filename="{written.name}"',
-                }
-            )
+            named = {"Content-Disposition": f'attachment; filename="{written.name}"'}
+            kind = {"Content-Type": "application/octet-stream"}
+            response = web.StreamResponse(headers={**self._headers, **kind, **named})
             file = await asyncio.to_thread(written.open, "rb")
             with file:
                 response.content_length = written.stat().st_size

@@ -172,45 +172,23 @@ def test_the_page_draws_cloudwatch_dashboards_from_their_metrics(embedded, open_
         ["Test/Page", "Laps", "Car", "a", {"stat": "Sum", "period": 60, "label": "laps of a"}],
         ["...", "b"],
     ]
+    query = "SOURCE 'page-test' | fields @timestamp, @log, @message | filter @message like /WARN/"
+    lines = {
+        "title": "What went wrong",
+        "query": f"{query} | sort @timestamp desc | limit 2",
+        "view": "table",
+    }
+    laps = {"title": "Laps driven", "metrics": rows, "view": "timeSeries"}
     widgets = [
-        {
-            "type": "text",
-            "x": 0,
-            "y": 0,
-            "width": 24,
-            "height": 1,
-            "properties": {"markdown": "# <b>Laps</b>"},
-        },
-        {
-            "type": "metric",
-            "x": 0,
-            "y": 1,
-            "width": 12,
-            "height": 6,
-            "properties": {
-                "title": "Laps driven",
-                "metrics": rows,
-                "region": "eu-west-1",
-                "view": "timeSeries",
-            },
-        },
+        {"type": kind, "x": 0, "y": 6 * i, "width": 12, "height": 6, "properties": properties}
+        for i, (kind, properties) in enumerate(
+            [
+                ("text", {"markdown": "# <b>Laps</b>"}),
+                ("metric", {**laps, "region": "eu-west-1"}),
+                ("log", {**lines, "region": "eu-west-1"}),
+            ]
+        )
     ]
-    widgets.append(
-        {
-            "type": "log",
-            "x": 0,
-            "y": 7,
-            "width": 24,
-            "height": 5,
-            "properties": {
-                "title": "What went wrong",
-                "query": "SOURCE 'page-test' | fields @timestamp, @log, @message "
-                "| filter @message like /WARN/ | sort @timestamp desc | limit 2",
-                "region": "eu-west-1",
-                "view": "table",
-            },
-        }
-    )
     logged(embedded.cloud, "page-test", "[WARN] first", "[INFO] fine", "[WARN] <b>bold</b>", "[WARN] last")
     cloudwatch.put_dashboard(
         DashboardName=f"{embedded.namespace}-test", DashboardBody=json.dumps({"widgets": widgets})

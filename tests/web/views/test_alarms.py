@@ -7,13 +7,11 @@ import threading
 import pytest
 
 from iort_contract.catalog.metrics import METRICS
-from iort_station.page import insights as laps
 from testkit.waiting import GUARD_S, until
 from tests.browser import plain, show
 from tests.unit.station.data.test_queries import START
-from tests.unit.station.data.test_runs import driven_cloud
 from tests.web.cars import SAMPLE
-from tests.web.lab import NOW_S, VIEWS, Lab, insights
+from tests.web.lab import END, NOW_S, VIEWS, Lab, insights
 
 
 def test_every_view_counts_the_alarms_and_each_says_what_to_do(open_page, lab, server):
@@ -137,11 +135,8 @@ def test_the_page_waits_for_a_log_query_across_dashboard_updates(open_page, serv
     assert [asked["minutes"] for asked in logs.queries] == ["60", "15"]
 
 
-END = START + 90_000_000
-
-
 class Analysed(Lab):
-    """A lab with the driven laps of `driven_cloud`, which are one drive, or one run until it is analysed."""
+    """A lab whose newest drive is one run until it is analysed."""
 
     def __init__(self):
         super().__init__()
@@ -154,13 +149,8 @@ class Analysed(Lab):
         part = {**extent, "batches": 90, "samples": 4500}
         run = {**extent, "run": "0badcafe", "state": "ended", "lost": 0, "streams": {"vesc": part}}
         runs = {"runs": [run], "older": False, "streams": {"vesc": extent}}
-        told = {"insights": self.insights, "runs": lambda _: runs, "analysis": self.progress}
-        cloud = driven_cloud()
-        of_car = {
-            name: lambda asked, answer=answer: answer(cloud, {**asked, "robot": "car"})
-            for name, answer in (("laps", laps.laps), ("delta", laps.delta))
-        }
-        return {**super().answers(), **told, **of_car}
+        more = {"insights": self.insights, "runs": lambda _: runs, "analysis": self.progress}
+        return {**super().answers(), **more}
 
     def analyse(self, asked):
         self.asked.append(dict(asked))
@@ -171,11 +161,7 @@ class Analysed(Lab):
         return {"running": not self.analysed, "drives": 1, "done": int(self.analysed)}
 
     def insights(self, asked):
-        told = insights(asked)
-        if not self.analysed:
-            return {**told, "findings": [], "drives": []}
-        newest = {**told["drives"][0], "from_us": START, "to_us": END}
-        return {**told, "drives": [newest, *told["drives"][6:]]}
+        return insights(asked) if self.analysed else {**insights(asked), "findings": [], "drives": []}
 
 
 @pytest.fixture
