@@ -74,13 +74,12 @@ export function readRoute(hash: string): Route {
   return { view: "fleet", query: read("fleet") };
 }
 
-const WORDS: Readonly<Record<string, readonly [reads: (value: string) => boolean, must: string]>> = {
-  ...Object.fromEntries(
-    ["from", "to", "at"].map((name) => [
-      name,
-      [(value: string) => !Number.isNaN(readTime(value)), "be a time like 2026-05-04T10:00:00.000Z"],
-    ]),
-  ),
+type Word = readonly [reads: (value: string) => boolean, must: string];
+const TIME: Word = [(value) => !Number.isNaN(readTime(value)), "be a time like 2026-05-04T10:00:00.000Z"];
+const WORDS: Readonly<Record<string, Word>> = {
+  from: TIME,
+  to: TIME,
+  at: TIME,
   stream: [(value) => NAME.test(value), "be a stream's name"],
   runs: [
     (value) =>

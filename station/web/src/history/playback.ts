@@ -1,6 +1,6 @@
 // The slider through a range, and its playback, slower or faster than it was driven.
 
-import { el, setAttribute, Text } from "../base/dom";
+import { button, choices, el, setAttribute, Text } from "../base/dom";
 import { when } from "../base/format";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4, 8, 16];
@@ -23,11 +23,13 @@ export class Playback {
     "aria-label": "Time within the range",
   });
   private readonly at = new Text("num scrub-at");
-  private readonly button = el("button", { type: "button", class: "tool play" }, "Play");
+  private readonly button = button("Play", () => (this.playing ? this.pause() : this.start()), {
+    class: "tool play",
+  });
   private readonly speed = el(
     "select",
     { class: "tool speed", "aria-label": "Speed of the playback" },
-    ...SPEEDS.map((each) => el("option", { value: String(each) }, `${each}×`)),
+    ...choices(SPEEDS.map((each) => [String(each), `${each}×`] as const)),
   );
   private times: readonly number[] = [];
   private timer: number | undefined;
@@ -36,7 +38,6 @@ export class Playback {
     this.speed.value = "1";
     this.slider.addEventListener("input", () => events.point(this.index));
     this.slider.addEventListener("change", events.rest);
-    this.button.addEventListener("click", () => (this.playing ? this.pause() : this.start()));
     this.node = el("div", { class: "scrubber" }, this.button, this.speed, this.slider, this.at.node);
   }
 

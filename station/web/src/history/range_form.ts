@@ -1,6 +1,6 @@
 // The controls of a range: its ends, the last minutes, the stream.
 
-import { el, Text } from "../base/dom";
+import { button, choices, el, form, Text } from "../base/dom";
 import { zone } from "../base/format";
 import type { Range } from "../base/range";
 
@@ -38,34 +38,20 @@ export class RangeForm {
   private readonly zone = new Text("zone");
   private readonly select = el("select", { id: "stream", name: "stream" });
   /** Goes back to the range before the zoom. */
-  readonly out = el(
-    "button",
-    { type: "button", class: "tool", hidden: "", title: "Also: a double click on a chart" },
-    "Zoom out",
-  );
+  readonly out: HTMLElement;
 
   constructor(events: RangeFormEvents) {
-    this.node = el(
-      "form",
+    this.out = button("Zoom out", events.out, { hidden: "", title: "Also: a double click on a chart" });
+    this.node = form(
       { class: "range", novalidate: "" },
-      ...LAST.map(([label, seconds]) => {
-        const button = el("button", { type: "button", class: "tool" }, `Last ${label}`);
-        button.addEventListener("click", () => events.last(seconds));
-        return button;
-      }),
+      () => this.submit(events),
+      ...LAST.map(([label, seconds]) => button(`Last ${label}`, () => events.last(seconds))),
       el("label", {}, "from ", this.from),
       el("label", {}, "to ", this.to, " ", this.zone.node),
       el("label", {}, "stream ", this.select),
       el("button", { type: "submit", class: "tool primary" }, "Load"),
     );
-    this.node.addEventListener("submit", (event) => {
-      event.preventDefault();
-      const wrong = [this.from, this.to].find((input) => Number.isNaN(seconds(input)));
-      if (wrong) events.wrong(`${wrong.name} must be a date and a time like ${FORM}, got "${wrong.value}".`);
-      else events.range([seconds(this.from), seconds(this.to)]);
-    });
     this.select.addEventListener("change", events.stream);
-    this.out.addEventListener("click", events.out);
     for (const each of [this.from, this.to]) each.addEventListener("input", () => this.sayZone());
   }
 
@@ -79,7 +65,13 @@ export class RangeForm {
   }
 
   streams(names: readonly string[]): void {
-    this.select.replaceChildren(...names.map((name) => el("option", { value: name }, name)));
+    this.select.replaceChildren(...choices(names));
+  }
+
+  private submit(events: RangeFormEvents): void {
+    const wrong = [this.from, this.to].find((input) => Number.isNaN(seconds(input)));
+    if (wrong) events.wrong(`${wrong.name} must be a date and a time like ${FORM}, got "${wrong.value}".`);
+    else events.range([seconds(this.from), seconds(this.to)]);
   }
 
   show([from, to]: Range, zoomed: boolean): void {

@@ -8,7 +8,7 @@ import {
   type FieldTable,
 } from "../base/contract";
 import { number } from "../base/format";
-import { AnswerError, act, ask } from "../server/answers";
+import { act, ask, words } from "../server/answers";
 import type { Fleet } from "./fleet";
 import { hottest, type Robot } from "./robot";
 import { numeric } from "./stream";
@@ -62,7 +62,7 @@ export class Alarms {
       const { alarms, user } = await ask<AlarmsAnswer>("alarms", {});
       [this.entries, this.user, this.error, this.askedAt] = [alarms, user, "", Date.now() / 1000];
     } catch (error) {
-      this.error = error instanceof AnswerError ? error.message : String(error);
+      this.error = words(error);
     }
   }
 

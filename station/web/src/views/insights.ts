@@ -11,7 +11,7 @@ import { findingsList } from "../insights/findings_list";
 import { LapsPanel } from "../insights/laps_panel";
 import { Parameters } from "../insights/parameters";
 import { may } from "../server/admission";
-import { ask, words } from "../server/answers";
+import { ask, Latest } from "../server/answers";
 import { NotesPanel } from "../widgets/notes_panel";
 import { type Services, type View, viewNode } from "./view";
 
@@ -33,7 +33,7 @@ export class InsightsView implements View<RouteTo<"insights">> {
     (text) => this.note.set(text),
     (drives) => void this.analysed(drives),
   );
-  private loading: AbortController | undefined;
+  private readonly loading = new Latest();
   private robot: string | undefined;
   private answer: InsightsAnswer | undefined;
   private drive: Range | undefined;
@@ -74,12 +74,16 @@ export class InsightsView implements View<RouteTo<"insights">> {
     if (!this.config.answers) return;
     this.analyse.of(robot);
     void this.notes.show(robot);
-    if (robot === this.robot && this.answer) void this.present(query);
-    else void this.load(robot, query);
+    if (robot !== this.robot || !this.answer) void this.load(robot, query);
+    else
+      void this.loading.run(
+        (signal) => this.present(query, signal),
+        (reason) => this.note.set(reason),
+      );
   }
 
   leave(): void {
-    this.loading?.abort();
+    this.loading.stop();
     this.analyse.stop();
     this.answer = undefined;
     this.laps.clear();
@@ -87,8 +91,6 @@ export class InsightsView implements View<RouteTo<"insights">> {
   }
 
   private async load(robot: string | undefined, query: Query<"insights">): Promise<void> {
-    this.loading?.abort();
-    const loading = (this.loading = new AbortController());
     this.robot = robot;
     this.answer = undefined;
     for (const part of [this.found, this.driven]) part.replaceChildren();
@@ -96,17 +98,25 @@ export class InsightsView implements View<RouteTo<"insights">> {
     this.laps.clear();
     this.laps.node.hidden = true;
     this.note.set("Loading …");
-    try {
-      const asked = robot === undefined ? {} : { robot };
-      this.answer = await ask<InsightsAnswer>("insights", asked, loading.signal);
-      if (!loading.signal.aborted) await this.present(query);
-    } catch (error) {
-      if (loading.signal.aborted) return;
-      this.note.set(words(error));
-      // Laps need no findings.
-      if (robot !== undefined && !this.answer)
-        await this.showLaps(robot, undefined, query).catch(() => undefined);
-    }
+    await this.loading.run(
+      async (signal) => {
+        const asked = robot === undefined ? {} : { robot };
+        this.answer = await ask<InsightsAnswer>("insights", asked, signal);
+        await this.present(query, signal);
+      },
+      (reason) => {
+        this.note.set(reason);
+        // Laps need no findings.
+        if (robot !== undefined && !this.answer) void this.lapsAlone(robot, query);
+      },
+    );
+  }
+
+  private async lapsAlone(robot: string, query: Query<"insights">): Promise<void> {
+    await this.loading.run(
+      (signal) => this.showLaps(robot, undefined, query, signal),
+      () => undefined,
+    );
   }
 
   /** Show the new findings; without drives, say why there are none. */
@@ -116,7 +126,7 @@ export class InsightsView implements View<RouteTo<"insights">> {
       this.note.set("No drives were found in that time: nothing was recorded, or the car stood.");
   }
 
-  private async present(query: Query<"insights">): Promise<void> {
+  private async present(query: Query<"insights">, signal: AbortSignal): Promise<void> {
     const { robot } = this;
     const answer = this.answer!;
     const { findings, drives } = answer;
@@ -140,14 +150,17 @@ export class InsightsView implements View<RouteTo<"insights">> {
     this.driven.replaceChildren(...(newest ? [drivesTable(drives, robot, chosen?.from_us)] : []));
     if (robot === undefined) return;
     this.parameters.show(answer);
-    await this.showLaps(robot, chosen, query);
+    await this.showLaps(robot, chosen, query, signal);
   }
 
   /** Show the laps of a drive; before anything is analysed, those of the newest run. */
-  private async showLaps(robot: string, of: Extent | undefined, query: Query<"insights">): Promise<void> {
-    const { signal } = this.loading!;
+  private async showLaps(
+    robot: string,
+    of: Extent | undefined,
+    query: Query<"insights">,
+    signal: AbortSignal,
+  ): Promise<void> {
     const extent = of ?? (await ask<RunsAnswer>("runs", { robot, count: "1" }, signal)).runs[0];
-    if (signal.aborted) return;
     this.laps.node.hidden = extent === undefined;
     if (!extent) return;
     this.drive = [extent.from_us / 1e6, extent.to_us / 1e6];
