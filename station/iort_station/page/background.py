@@ -117,11 +117,11 @@ class BackgroundServer:
             return
         logger = logging.getLogger(f"aiohttp.server.{type(self).__name__}")
         logger.addFilter(_is_our_fault)
-        asked: set[Any] = set()
+        requested: set[Any] = set()
 
         async def handle(request: web.BaseRequest) -> web.StreamResponse:
             if self._idle_s is not None:
-                asked.add(request.protocol)
+                requested.add(request.protocol)
             return await self.handle(request)
 
         server = web.Server(
@@ -132,7 +132,7 @@ class BackgroundServer:
         await web.SockSite(runner, listening, ssl_context=self._tls).start()
         closing = None
         if self._idle_s is not None:
-            closing = asyncio.create_task(self._close_silent(server, asked, self._idle_s))
+            closing = asyncio.create_task(self._close_silent(server, requested, self._idle_s))
         try:
             async with self.beside():
                 if not started.done():
@@ -146,7 +146,7 @@ class BackgroundServer:
             await _drop_connections(server)
             await runner.cleanup()
 
-    async def _close_silent(self, server: web.Server, asked: set[Any], idle_s: float) -> None:
+    async def _close_silent(self, server: web.Server, requested: set[Any], idle_s: float) -> None:
         """Close connections without a first request, for which aiohttp waits for ever."""
         before: set[Any] = set()
 
@@ -155,8 +155,8 @@ class BackgroundServer:
             while True:
                 await self.pause(idle_s)
                 now = set(server.connections)
-                asked.intersection_update(now)
-                for connection in (before & now) - asked:
+                requested.intersection_update(now)
+                for connection in (before & now) - requested:
                     if connection.transport is not None:
                         connection.transport.abort()
                 before = now

@@ -113,7 +113,7 @@ def _drive(drive: AnalysedDrive) -> messages.DriveEntry:
         "samples": drive.samples,
         "failed": "",
         "repairs": dict(drive.repairs),
-        "estimates": {name: estimate(one) for name, one in drive.estimates.items()},
+        "estimates": {name: estimate(entry) for name, entry in drive.estimates.items()},
         "missing": dict(drive.missing),
     }
 
@@ -147,7 +147,7 @@ def laps(cloud: Cloud, request: Mapping[str, str]) -> messages.LapsAnswer:
     """The laps of ``robot`` from ``from_us`` to ``to_us``."""
     mined = _mined_of(cloud, request)
     table = mined.tables.get(LAPS_TABLE)
-    estimates = {name: estimate(one) for name, one in mined.estimates.items()}
+    estimates = {name: estimate(entry) for name, entry in mined.estimates.items()}
     if table is None:
         reason = next(iter(mined.missing.values()), "no laps")
         return {"laps": [], "method": "", "confidence": 0.0, "reason": reason, "estimates": estimates}

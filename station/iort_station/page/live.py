@@ -108,8 +108,8 @@ class Car:
 
 def problem(update: Any, error: ContractError) -> str:
     """Whose update is malformed, if that is known, and why."""
-    told = update if isinstance(update, dict) else {}
-    robot, why = told.get(ROBOT), told.get("error", str(error))
+    known = update if isinstance(update, dict) else {}
+    robot, why = known.get(ROBOT), known.get("error", str(error))
     return f"of {robot}: {why}" if isinstance(robot, str) else str(why)
 
 

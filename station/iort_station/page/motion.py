@@ -123,18 +123,19 @@ class Fleet:
         stops = {"true": True, "false": False}.get(text(request, "stopped"))
         if stops is None:
             raise StationError("stopped must be true or false")
-        one = [check_robot(request["robot"])] if request.get("robot") else None
+        chosen = [check_robot(request["robot"])] if request.get("robot") else None
         # As they were last read, if they ever were.
         known = list(self._robots)
-        cloud, fleet = self._urgent, one is None
+        cloud, fleet = self._urgent, chosen is None
         if stops:
             # Nothing is looked up before it.
-            failed = stopping.stop(cloud, one or known, by=user(), fleet=fleet)
-            robots = one or self._names(known)
-            failed |= stopping.stop(cloud, set(robots) - set(one or known), by=user(), fleet=fleet)
-            failed |= stopping.take_back(cloud, set(one) - set(known) if one else set(known) - set(robots))
+            failed = stopping.stop(cloud, chosen or known, by=user(), fleet=fleet)
+            robots = chosen or self._names(known)
+            failed |= stopping.stop(cloud, set(robots) - set(chosen or known), by=user(), fleet=fleet)
+            unknown = set(chosen) - set(known) if chosen else set(known) - set(robots)
+            failed |= stopping.take_back(cloud, unknown)
         else:
-            robots = one or self._names(known)
+            robots = chosen or self._names(known)
             seen_ms = whole(request, "seen_ms", 0, 10**15)
             failed = stopping.release(cloud, robots, by=user(), fleet=fleet, seen_ms=seen_ms)
         # Read again when asked next, and often.

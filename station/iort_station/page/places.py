@@ -59,7 +59,7 @@ class Places:
             self._clients[client] += 1
             self._kinds[client, kind] += 1
             return
-        waiting = sum(one.client == client for one in self._waiting)
+        waiting = sum(request.client == client for request in self._waiting)
         if waiting >= self._most_waiting or len(self._waiting) >= self._most_waiting * self._most:
             raise self._busy(client, kind)
         request = _Request(client, kind, asyncio.get_running_loop().create_future())
@@ -81,10 +81,10 @@ class Places:
         # Without a count of zero: there are many clients.
         self._clients -= Counter([client])
         self._kinds -= Counter([(client, kind)])
-        ready = [one for one in self._waiting if self._admits(one.client, one.kind)]
+        ready = [request for request in self._waiting if self._admits(request.client, request.kind)]
         if ready:
             # The first of those with the fewest places.
-            first = min(ready, key=lambda one: self._clients[one.client])
+            first = min(ready, key=lambda request: self._clients[request.client])
             self._waiting.remove(first)
             self._clients[first.client] += 1
             self._kinds[first.client, first.kind] += 1
@@ -180,7 +180,7 @@ def client_of(address: str) -> str:
     """Who a limit for each client counts: an IPv4 address, or the network of an IPv6 address, because whoever
     has one address of it has them all."""
     try:
-        found = ipaddress.ip_address(address.partition("%")[0])
+        known = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:
         return address
-    return str(found) if found.version == 4 else str(ipaddress.ip_network((found, 64), strict=False))
+    return str(known) if known.version == 4 else str(ipaddress.ip_network((known, 64), strict=False))

@@ -46,9 +46,9 @@ def as_json(value: Mapping[str, Any], level: int = 6) -> Body:
 def _finite(value: Any) -> Any:
     """The value, with null for each number that JSON does not have."""
     if isinstance(value, Mapping):
-        return {name: _finite(one) for name, one in value.items()}
+        return {name: _finite(entry) for name, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(one) for one in value]
+        return [_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
