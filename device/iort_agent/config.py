@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from iort_agent.common.schema import (
+    FILE,
     Place,
     allowed,
-    any_path,
-    existing_path,
     items,
     load,
     number,
+    path,
     read_yaml,
     section,
     setting,
@@ -44,12 +44,12 @@ class Config:
 
     robot: str = setting(text(check_robot))
     endpoint: str = setting(text())
-    certificate: Path = setting(existing_path())
-    private_key: Path = setting(existing_path())
+    certificate: Path = setting(FILE)
+    private_key: Path = setting(FILE)
     sources: tuple[SourceConfig, ...] = setting(
         items(variant("type", SOURCES), at_least=1, what="a list of at least one source")
     )
-    root_ca: Path | None = setting(existing_path(), None)
+    root_ca: Path | None = setting(FILE, None)
     namespace: str = setting(text(check_namespace), DEFAULT_NAMESPACE)
     port: int = setting(number(1, 65535, whole=True), 8883)
     record: RecordConfig = setting(section(RecordConfig), RecordConfig())
@@ -61,7 +61,7 @@ class Config:
     downlink: DownlinkConfig = setting(section(DownlinkConfig), DownlinkConfig())
     motion: MotionState = setting(section(MotionState), MotionState())
     share: tuple[tuple[str, ShareConfig], ...] = setting(share_rule(), ())
-    status_socket: Path | None = setting(any_path(), None)
+    status_socket: Path | None = setting(path(), None)
     log_level: str = setting(allowed(SETTINGS["log_level"]), "info")
 
 

@@ -163,6 +163,11 @@ class Agent(NamedTuple):
         alarms = self.status().get("alarms")
         return None if alarms is None else [one for one in alarms if one.startswith("source waits")]
 
+    def topic(self, name: str) -> dict[str, Any]:
+        """Return the counts of a topic of the first source."""
+        counts: dict[str, Any] = self.status().get("sources", [{}])[0].get(name, {})
+        return counts
+
     def samples(self, stream: str) -> int:
         return int(self.status().get("streams", {}).get(stream, {}).get("samples", 0))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import itertools
 import json
 import time
@@ -93,36 +91,6 @@ def test_every_message_of_an_unknown_type_is_read(cars: Cars) -> None:
     }  # fmt: skip
 
 
-def test_only_selected_fields_are_read(cars: Cars) -> None:
-    collector = cars.collector(fields=["turns", "load.1"])
-    cars.publisher("pub")
-    until_turns(collector, 5)
-    assert samples(collector)[-1][1].keys() == {"turns", "load.1"}
-
-
-def test_a_topic_with_upload_hands_over_its_bytes(cars: Cars) -> None:
-    definition = f"# A picture.\nHeader header\nuint32 turns\nuint8[] data\n{HEADER}"
-    topics = {
-        f"/{large}": {"stream": large, "time": "header", "large": large} for large in ("upload", "refuse")
-    }
-    file = cars.graph.folder / "source.json"
-    file.write_text(json.dumps({"topics": topics}))
-    collector = cars.graph.run("collector.py", file)
-    for topic in topics:
-        message = cars.graph.folder / f"{topic[1:]}.msg"
-        message.write_text(definition)
-        arguments = ["--field", "turns", "--bytes", 300_000, "--count", 5]
-        cars.graph.run("publisher.py", topic[1:], topic, "strange_msgs/Picture", message, *arguments)
-        until_turns(collector, 4, topic[1:])
-    content = bytes(i % 251 for i in range(300_000))
-    of = {stream: emitted(collector, stream) for stream in ("upload", "refuse")}
-    assert [line[4] for line in of["upload"]] == [{"data": hashlib.sha256(content).hexdigest()}] * 5
-    assert [line[4] for line in of["refuse"]] == [{}] * 5
-    # The message is available either way, and the view has the columns of a table.
-    assert all(content in base64.b64decode(line[3]) for line in of["upload"] + of["refuse"])
-    assert {tuple(values) for _, values in samples(collector, "refuse")} == {("turns",)}
-
-
 def test_the_source_survives_a_late_and_a_restarted_master(cars: Cars) -> None:
     cars.graph.master.kill()
     collector = cars.collector("/wheel", "/other")
@@ -173,23 +141,9 @@ def test_two_publishers_of_one_topic_may_have_two_definitions(cars: Cars) -> Non
     assert sorted(turns(collector)) == [*range(50), *range(1000, 1050)]
 
 
-def test_stamps_of_a_simulation_are_flagged_and_not_used(cars: Cars) -> None:
-    collector = cars.collector()
-    cars.publisher("pub", stamp=100, count=10)
-    until_turns(collector, 9)
-    assert all(abs(t_us / 1e6 - time.time()) < 60 for t_us, _ in samples(collector))
-    assert json.loads(collector.quit()[-1])["/wheel"]["unbelieved_stamps"] == 10
-
-
 def test_use_sim_time_is_detected_while_running(cars: Cars) -> None:
     collector = cars.collector()
     cars.publisher("pub")
     until_turns(collector, 5)
     cars.graph.parameter("/use_sim_time", True)
     collector.until_said("/use_sim_time")
-
-
-@pytest.mark.parametrize("script", ["against_genpy.py", "rosbridge_against_genpy.py"])
-def test_decoding_and_writing_agree_with_genpy(graph: Graph, script: str) -> None:
-    found = graph.run(script)
-    found.until(lambda: "agreed" in "".join(found.lines), "agreement")

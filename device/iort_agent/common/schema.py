@@ -133,30 +133,22 @@ def text(check: Callable[[str], str] | None = None) -> Rule:
     return rule
 
 
-def existing_path(*, folder: bool = False) -> Rule:
-    """The path of an existing file, or of an existing folder if ``folder`` allows it."""
-    what = "a file or folder that exists" if folder else "a file that exists"
+def path(allowed: str = "a path", *, fits: Callable[[Path], bool] | None = None) -> Rule:
+    """A path that ``fits``, if that is given."""
 
     def rule(value: Any, place: Place) -> Path:
         if not isinstance(value, str) or not value:
-            raise place.error(value, f"the path of {what}")
-        path = place.path(value)
-        if not (path.exists() if folder else path.is_file()):
-            raise place.error(value, f"the path of {what}", f"; there is none at {path}")
-        return path
+            raise place.error(value, allowed)
+        target = place.path(value)
+        if fits is not None and not fits(target):
+            raise place.error(value, allowed, f"; there is none at {target}")
+        return target
 
     return rule
 
 
-def any_path() -> Rule:
-    """A path, whether something exists there or not."""
-
-    def rule(value: Any, place: Place) -> Path:
-        if not isinstance(value, str) or not value:
-            raise place.error(value, "a path")
-        return place.path(value)
-
-    return rule
+FILE = path("the path of a file that exists", fits=Path.is_file)
+FOLDER = path("the path of a folder that exists", fits=Path.is_dir)
 
 
 def items(rule: Rule, *, at_least: int = 0, what: str) -> Rule:

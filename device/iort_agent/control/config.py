@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any, Mapping
 
 from iort_agent.common.schema import (
+    FILE,
     Place,
     Rule,
     allowed,
-    existing_path,
     flag,
     number,
     pairs,
@@ -135,7 +135,7 @@ class AskConfig:
 
     timeout_s: float = setting(number(0.1, MAX_ASK_MS / 1000, unit="s"), 15.0)
     body: Mapping[str, Any] | None = setting(_object, default=None)
-    body_file: Path | None = setting(existing_path(), default=None)
+    body_file: Path | None = setting(FILE, default=None)
 
     def question(self) -> Mapping[str, Any]:
         """The body of a question without one of its own. Raises `AskError`."""

@@ -20,7 +20,8 @@ from iort_contract.topics import FLEET, parse_topic
 _MAX_ROBOTS = 64
 # A message waits this long for the rate limiter, unless a newer one replaces it.
 _NO_ROOM_S = 0.05
-_MAX_DEFINITIONS = 8
+# Of all shared topics.
+_parse = functools.lru_cache(maxsize=64)(parse)
 
 
 class _Heard:
@@ -100,15 +101,6 @@ class _Shared:
         self.due = 0.0
         self.seq = 0
         self.newest: tuple[Mapping[str, str], bytes, float] | None = None
-        self.definitions: dict[tuple[str, str], Definition] = {}
-
-    def definition(self, header: Mapping[str, str]) -> Definition:
-        key = (header.get("type", ""), header.get("message_definition", ""))
-        if key not in self.definitions:
-            if len(self.definitions) >= _MAX_DEFINITIONS:
-                self.definitions.clear()
-            self.definitions[key] = parse(*key)
-        return self.definitions[key]
 
 
 class Shares:
@@ -164,7 +156,8 @@ class Shares:
         if now - at > FLEET_MAX_AGE_MS / 1000 or not self._link.uplink.connected():
             return
         try:
-            message = decode(shared.definition(header), data)
+            definition = _parse(header.get("type", ""), header.get("message_definition", ""))
+            message = decode(definition, data)
             payload = encode_fleet(
                 FleetMessage(self._boot, shared.seq, self._clock.now_us(), message, self._bridge.offset_us())
             )

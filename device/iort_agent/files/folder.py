@@ -14,10 +14,10 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, Iterator, NamedTuple
+from typing import Iterator, NamedTuple
 
 from iort_agent.common.private_files import folder_of, open_below, write_below
-from iort_agent.common.schema import Place, any_path, number, setting
+from iort_agent.common.schema import FOLDER, number, path, setting
 from iort_agent.common.state import Files
 from iort_agent.common.threads import Clock
 from iort_agent.errors import UploadError
@@ -243,13 +243,6 @@ def _saved(line: bytes) -> tuple[Path, _Done] | None:
         return None
 
 
-def _folder(value: Any, place: Place) -> Path:
-    path: Path = any_path()(value, place)
-    if not path.is_dir():
-        raise place.error(value, "the path of a folder that exists", f"; there is none at {path}")
-    return path
-
-
 @dataclass(frozen=True)
 class FilesConfig:
     """Files to upload. A file in ``folder`` is finished when it has not changed for ``settle_s``. It is
@@ -261,11 +254,11 @@ class FilesConfig:
     from each stream, and no more than ``large_max_mb`` (1e6 bytes) in all.
     """
 
-    folder: Path | None = setting(_folder, None)
+    folder: Path | None = setting(FOLDER, None)
     settle_s: float = setting(number(1, 86_400, unit="s"), 10.0)
     remove_after_s: float | None = setting(number(0, 365 * 86_400, unit="s"), None)
     rate_kb_s: float = setting(number(0, 1e6, unit="kB/s"), 1000.0)
-    large_folder: Path | None = setting(any_path(), None)
+    large_folder: Path | None = setting(path(), None)
     large_every_s: float = setting(number(0, 86_400, unit="s"), 1.0)
     large_max_mb: float = setting(number(1, 1e6, unit="MB"), 1000.0)
 

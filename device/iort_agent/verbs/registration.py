@@ -17,7 +17,7 @@ from pathlib import Path, PurePath
 from typing import Any, Callable, Mapping
 
 from iort_agent.common.private_files import open_below, write_below
-from iort_agent.common.schema import Place, any_path, existing_path, load, number, read_yaml, setting, text
+from iort_agent.common.schema import FILE, Place, load, number, path, read_yaml, setting, text
 from iort_agent.errors import IdentityError, RefusedError
 from iort_agent.identity import check_pair, load_x509
 from iort_contract.cloud import claim_name, fleet_name
@@ -60,9 +60,9 @@ def make_key(robot: str) -> tuple[str, str]:
 
 def machine_serial() -> str:
     """The machine's serial number. If the hardware has one, a copy of the disk image does not share it."""
-    for path in _SERIALS:
+    for file in _SERIALS:
         with contextlib.suppress(OSError, UnicodeDecodeError):
-            serial = path.read_text(encoding="ascii").strip("\0 \n")
+            serial = file.read_text(encoding="ascii").strip("\0 \n")
             if serial:
                 return serial
     raise IdentityError("this machine has no serial number: set `serial` in the claim's file")
@@ -73,14 +73,14 @@ class Claim:
     """The content of claim.yaml. ``config`` is the configuration file to write or to update."""
 
     endpoint: str = setting(text())
-    certificate: Path = setting(existing_path())
-    private_key: Path = setting(existing_path())
-    root_ca: Path | None = setting(existing_path(), None)
+    certificate: Path = setting(FILE)
+    private_key: Path = setting(FILE)
+    root_ca: Path | None = setting(FILE, None)
     namespace: str = setting(text(check_namespace), DEFAULT_NAMESPACE)
     port: int = setting(number(1, 65535, whole=True), 8883)
     robot: str | None = setting(text(check_robot), None)
     serial: str | None = setting(text(), None)
-    config: Path | None = setting(any_path(), None)
+    config: Path | None = setting(path(), None)
 
 
 def load_claim(file: Path) -> Claim:

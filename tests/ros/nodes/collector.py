@@ -1,6 +1,6 @@
 """The agent's ros1 source alone, in its own process; each sample is a line of JSON on standard output.
 
-A line has stream, time and values, then the message's bytes and the SHA-256 of its large fields. Usage:
+A line has stream, time and values, then the message's bytes. Usage:
 ``collector.py CONFIG.json`` with the source's settings; ``quit`` on standard input ends it, and the last
 line is the source's report.
 """
@@ -12,7 +12,6 @@ import json
 import logging
 import sys
 import threading
-from hashlib import sha256
 from pathlib import Path
 
 from iort_agent.common.schema import Place, load
@@ -42,8 +41,7 @@ def listen() -> None:
 def emit(stream, t_us, values):
     sample = [stream, t_us, dict(values)]
     if isinstance(values, RosMessage):
-        large = {name: sha256(content).hexdigest() for name, content in values.large.items()}
-        sample += [base64.b64encode(values.raw).decode(), large]
+        sample.append(base64.b64encode(values.raw).decode())
     say(json.dumps(sample))
 
 

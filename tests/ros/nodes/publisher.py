@@ -26,7 +26,6 @@ parser.add_argument("--count", type=int, default=0, help="stop counting after so
 parser.add_argument("--stamp", default="now", help="now, or seconds since the epoch")
 parser.add_argument("--latch", action="store_true", help="repeat the last message to who connects")
 parser.add_argument("--field", required=True, help="dotted path of the field that counts")
-parser.add_argument("--bytes", type=int, default=0, help="so many in a field data of uint8[]")
 options = parser.parse_args()
 
 text = Path(options.definition).read_text()
@@ -53,8 +52,6 @@ target = message
 *path, last = options.field.split(".")
 for name in path:
     target = getattr(target, name)
-if options.bytes:
-    message.data = bytes(i % 251 for i in range(options.bytes))
 while not stop.is_set():
     if options.count and n >= options.count:
         stop.wait()

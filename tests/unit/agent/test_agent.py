@@ -462,11 +462,6 @@ def config_file(folder: Path, source: str, more: str = "") -> Path:
     return file
 
 
-def test_the_command_checks_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--config", str(config_file(tmp_path, "{type: sim}")), "--check-config"]) == 0
-    assert "good, robot car1, 1 source" in capsys.readouterr().out
-
-
 def test_remappings_of_roslaunch_are_accepted(tmp_path: Path) -> None:
     config = str(config_file(tmp_path, "{type: sim}"))
     remappings = ["__name:=x", "__log:=/tmp/y.log", "/from:=/to", "~from:=to", "from:=/to", "_rate:=5"]

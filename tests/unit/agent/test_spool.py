@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import random
 import shutil
 import sqlite3
-import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -405,92 +402,6 @@ def test_after_a_power_cut_the_queue_may_be_older_and_says_no_more_than_it_knows
         assert kept(spool) == [0, 1]
         assert spool.previous("vesc") == ((BOOT, 1),)
         assert spool.alarm is None
-
-
-VICTIM = """
-import os, sys, threading
-from pathlib import Path
-from iort_agent.common.threads import SystemClock
-from iort_agent.spool.sqlite import SqliteSpool
-
-path, run = Path(sys.argv[1]), sys.argv[2]
-spool = SqliteSpool(path, max_bytes=2**30, clock=SystemClock())
-wake = threading.Event()
-spool.on_stored(wake.set)
-spool.start()
-for stream in ("a", "b"):
-    named = " ".join(f"{end.boot}:{end.seq}" for end in spool.previous(stream))
-    os.write(1, f"{stream} before {named}\\n".encode())
-
-def puts():
-    seq = 0
-    while run != "last":
-        for stream in ("a", "b"):
-            spool.put(stream, run, seq, f"{run} {stream} {seq} ".encode() * 20, samples=1)
-        seq += 1
-        threading.Event().wait(0.0005)
-
-threading.Thread(target=puts, daemon=True).start()
-last = count = 0
-while True:
-    wake.clear()
-    entry = spool.next(last)
-    if entry is None:
-        if run == "last" and not spool.backlog().batches:
-            break
-        wake.wait(1)
-        continue
-    last = entry.id
-    count += 1
-    os.write(1, f"{entry.payload[:40].decode()}\\n".encode())
-    spool.ack(entry.id)
-    if run != "last" and count % 300 == 0:
-        last = 0
-spool.close()
-os.write(1, b"end\\n")
-"""
-
-
-def test_kill_9_at_random_moments_loses_no_published_batch_and_names_the_last_of_every_run(
-    path: Path,
-) -> None:
-    chance = random.Random(7)
-    arrived: dict[str, dict[str, list[int]]] = {"a": {}, "b": {}}
-    named: dict[str, dict[str, int]] = {"a": {}, "b": {}}
-    for run in [*map(str, range(15)), "last"]:
-        victim = subprocess.Popen(
-            [sys.executable, "-c", VICTIM, str(path), run], cwd=ROOT, stdout=subprocess.PIPE, text=True
-        )
-        lines = chance.randrange(1, 800)
-        assert victim.stdout is not None
-        complete = False
-        for i, line in enumerate(victim.stdout):
-            if line == "end\n":
-                complete = True
-                break
-            if not line.endswith("\n"):
-                break
-            first, second, *rest = line.split()
-            if second == "before":
-                ends = (each.partition(":") for each in rest)
-                named[first].update((boot, int(seq)) for boot, _, seq in ends)
-                continue
-            numbers = arrived[second].setdefault(first, [])
-            if int(rest[0]) not in numbers[-2000:]:
-                numbers.append(int(rest[0]))
-            if run != "last" and i == lines:
-                victim.kill()
-        victim.stdout.close()
-        victim.kill()
-        victim.wait()
-        assert complete == (run == "last")
-    for stream, runs in arrived.items():
-        for run, seqs in runs.items():
-            assert seqs == list(range(len(seqs))), f"{stream}: each one, in order, without a hole"
-            # All that was durable has arrived, and the next run said how much that was.
-            assert named[stream][run] == seqs[-1]
-        assert len(runs) > 10
-        assert sum(map(len, runs.values())) > 500
 
 
 # --- its thread and its file ---------------------------------------------------------------------------

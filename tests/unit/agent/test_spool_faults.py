@@ -140,30 +140,6 @@ def test_a_part_that_cannot_be_read_is_damage_if_the_disk_works(path: Path) -> N
     assert len(aside(path)) == 1
 
 
-LIMITED = """
-import resource, sys
-from pathlib import Path
-from iort_agent.common.threads import SystemClock
-from iort_agent.spool.sqlite import SqliteSpool
-
-spool = SqliteSpool(Path(sys.argv[1]), max_bytes=2**30, clock=SystemClock())
-_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))
-for seq in range(1000):
-    spool.put("vesc", "0badcafe", seq, b"x" * 1000, samples=1)
-spool.work()
-assert spool.alarm is not None and "disk" in spool.alarm, spool.alarm
-resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
-spool.close()
-"""
-
-
-def test_a_limit_of_the_operating_system_is_survived_too(path: Path) -> None:
-    subprocess.run([sys.executable, "-c", LIMITED, str(path)], cwd=ROOT, check=True, timeout=60)
-    with running(path, max_bytes=10 * MB) as spool:
-        assert kept(spool) == list(range(1000))
-
-
 # --- damage -------------------------------------------------------------------------------------------
 
 

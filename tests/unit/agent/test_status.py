@@ -275,7 +275,7 @@ def test_status_shows_files_and_a_robot_over_its_share(state: dict[str, Any]) ->
 def test_status_shows_the_counts_of_the_sources(state: dict[str, Any]) -> None:
     state["sources"] = [
         {"source": "bag ride.csv", "rows": 168, "skipped": {"columns": 100, "time": 40}, "bad_cells": {},
-         "clock_back": 53, "columns_left_out": ["note", "gnss lat"], "gnss_ahead_ms": None},
+         "clock_back": 53, "columns_left_out": ["note", "gnss lat"]},
         {"source": "ROS 1", "/tf": {"messages": 7, "silent": True, "left_out": {"a.b": 2}, "odd": 0}},
         {"source": "VESC", "samples": 0},
         {"source": "ROS 1 topics",

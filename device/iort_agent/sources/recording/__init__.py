@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ContextManager, Iterator, Mapping, Sequence
 
-from iort_agent.common.schema import choice, existing_path, flag, number, pairs, setting, text
+from iort_agent.common.schema import choice, flag, number, pairs, path, setting, text
 from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, Emit, Finding, SourceConfig
@@ -30,7 +30,7 @@ class BagConfig(SourceConfig):
     recording's time. ``large: upload`` sends bytes (images, point clouds) as files.
     """
 
-    path: Path = setting(existing_path(folder=True))
+    path: Path = setting(path("the path of a file or folder that exists", fits=Path.exists))
     topics: tuple[tuple[str, str], ...] | None = setting(
         pairs(text(check_stream), what="a mapping of ROS topic to stream name, such as {/scan: scan}"),
         default=None,

@@ -150,7 +150,6 @@ class Columns:
 
 _log = logging.getLogger(__name__)
 
-_GNSS_TIME = "gnss_posTime"
 # VESC Tool names a log by its local start time. The rows' time of day is UTC since September 2019.
 _BEGUN = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")
 _BEGUN_FORMAT = "%Y-%m-%d_%H-%M-%S"
@@ -158,8 +157,6 @@ _BEGUN_FORMAT = "%Y-%m-%d_%H-%M-%S"
 _FIRST_ROWS = 100
 # VESC Tool writes about 60 columns.
 _MAX_COLUMNS, _MAX_LINE = 4096, 256 * 1024
-# A fix is older than its row by up to three seconds, and a phone's clock may be off by as much again.
-_GNSS_APART_MS = 60_000
 
 
 class VescLog:
@@ -174,18 +171,16 @@ class VescLog:
         self._skipped: Counter[str] = Counter()
         self._bad_cells: Counter[str] = Counter()
         self._dropped: list[str] = []
-        self._gnss_ahead_ms: int | None = None
 
     def report(self) -> dict[str, Any]:
         """The counts: rows read; rows skipped, by cause; cells without a number, by column; rows before which
-        the clock went back; the columns without numbers; and how far the first position's time is ahead."""
+        the clock went back; and the columns without numbers."""
         return {
             "rows": self._rows_read,
             "skipped": dict(self._skipped),
             "bad_cells": dict(self._bad_cells),
             "clock_back": self._clock_back,
             "columns_left_out": list(self._dropped),
-            "gnss_ahead_ms": self._gnss_ahead_ms,
         }
 
     def __call__(self) -> VescLog:
@@ -228,7 +223,6 @@ class VescLog:
             for column, why in columns.bad:
                 self._bad_cells[column] += 1
                 self._once(f"cell {column}", f"row {number}: {why}: null")
-            self._compare(ms_today, sample.get(_GNSS_TIME))
             yield Message(self._stream, at_ms * 1_000_000, base_ns + measured_ms * 1_000_000, sample)
         if not elapsed.rows:
             raise SourceError(f"{self._path}: it has no row that can be read")
@@ -263,20 +257,6 @@ class VescLog:
     def _skip(self, number: int, error: BadRowError) -> None:
         self._skipped[error.cause] += 1
         self._once("skipped", f"row {number} is skipped: {error}")
-
-    def _compare(self, ms_today: int, fix_ms: Value) -> None:
-        """Compare the first position's time, always UTC, with its row's."""
-        if self._gnss_ahead_ms is not None or not isinstance(fix_ms, (int, float)) or not fix_ms > 0:
-            return
-        # Over midnight, too: between minus and plus half a day.
-        ahead_ms = (round(fix_ms) - ms_today + DAY_MS // 2) % DAY_MS - DAY_MS // 2
-        self._gnss_ahead_ms = ahead_ms
-        if abs(ahead_ms) > _GNSS_APART_MS:
-            self._once(
-                "gnss",
-                f"the clock of the log is {-ahead_ms / 1000:+.0f} s off, by the first position's time "
-                f"({_GNSS_TIME}); VESC Tool of before September 2019 wrote local time",
-            )
 
     def _lines(self) -> Iterator[tuple[int, str]]:
         """The lines that are not empty, numbered as in an editor."""

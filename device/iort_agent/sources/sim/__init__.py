@@ -8,7 +8,7 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Sequence
 
-from iort_agent.common.schema import Place, Rule, choice, existing_path, items, number, section, setting, text
+from iort_agent.common.schema import FILE, Place, Rule, choice, items, number, section, setting, text
 from iort_agent.common.threads import Clock, Pace
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import Graph, OnBytes
@@ -184,7 +184,7 @@ class PoseConfig:
 
 
 def _track(value: Any, place: Place) -> Track:
-    path = existing_path()(value, place)
+    path = FILE(value, place)
     try:
         with path.open("rb") as file:
             return parse_track(file.read(_MAX_TRACK_BYTES).decode())

@@ -169,18 +169,6 @@ def test_a_command_that_passes_while_its_topic_is_released_stays() -> None:
     assert [topic for topic, _ in graph.published][-3:] == ["released", "free", STOP[0]]
 
 
-def test_a_command_that_waited_in_a_frozen_car_keeps_only_the_rest_of_its_lease() -> None:
-    rig = Rig()
-    waiting = [T0 + i * 100_000 for i in range(20)]
-    rig.clock.advance(2)
-    for sent_us in waiting:
-        rig.send({"data": 1.0}, started_us=T0, sent_us=sent_us, valid_ms=60_000)
-    # Sent 0.2 and 0.1 s ago, with 0.3 s each: the last one holds for another 0.2 s.
-    assert len(rig.graph.published) == 2
-    assert rig.refused() == {"cmd/iort/car1/speed stale": 10, "cmd/iort/car1/speed lease_over": 8}
-    assert rig.downlink.tick() == pytest.approx(0.2)
-
-
 def test_a_lease_that_ends_stops_the_car(caplog: pytest.LogCaptureFixture) -> None:
     rig = Rig()
     rig.send({"data": 2.5})

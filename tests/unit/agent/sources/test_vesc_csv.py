@@ -60,7 +60,6 @@ def test_a_real_ride(log: pytest.LogCaptureFixture) -> None:
     assert len(samples) == 877
     assert report == {
         "rows": 877, "skipped": {}, "bad_cells": {}, "clock_back": 0, "columns_left_out": [],
-        "gnss_ahead_ms": None,
     }  # fmt: skip
     stream, t_us, first = samples[0]
     assert (stream, t_us) == ("vesc", NOW)
@@ -156,25 +155,6 @@ def test_an_agent_in_another_zone_than_the_phone_gets_the_same_instants(tmp_path
     # Half past midnight in Berlin's summer, read by a robot whose clock shows UTC.
     path = write(tmp_path, row(81_271_500), name="2024-06-12_00-34-31.csv")
     assert play(path, stamps="original")[0][1] == 1_718_145_271_500_000
-
-
-@pytest.mark.parametrize(
-    ("fix_ms", "ahead_ms"),
-    [
-        # Two seconds old; a clock an hour behind; local time two hours ahead of UTC; over midnight.
-        (1_000_000, -2_000), (4_602_000, 3_600_000), (80_202_000, -7_200_000), (85_402_000, -2_000_000),
-    ],
-)  # fmt: skip
-def test_the_time_of_the_position_is_a_check_of_the_clock(
-    tmp_path: Path, log: pytest.LogCaptureFixture, fix_ms: int, ahead_ms: int
-) -> None:
-    header = HEADER + ";gnss_posTime"
-    rows = [row(1_001_900) + "-1;", row(1_002_000) + f"{fix_ms};", row(1_003_000) + f"{fix_ms};"]
-    samples, report = play_and_report(write(tmp_path, *rows, header=header))
-    assert report["gnss_ahead_ms"] == ahead_ms
-    off = f"the clock of the log is {-ahead_ms / 1000:+.0f} s off, by the first position's time"
-    assert log.text.count(off) == (0 if ahead_ms == -2_000 else 1)
-    assert [values["gnss_posTime"] for _, _, values in samples] == [-1, fix_ms, fix_ms]
 
 
 @pytest.mark.parametrize("name", ["ride.csv", "2024-13-12_00-34-31.csv"])
