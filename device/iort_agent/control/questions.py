@@ -6,7 +6,6 @@ import functools
 import hashlib
 import http.client
 import json
-import logging
 import queue
 import tempfile
 import threading
@@ -19,11 +18,12 @@ from iort_agent.common.state import ClockOffset
 from iort_agent.common.threads import Supervised, later
 from iort_agent.control import Bridge, offset_us
 from iort_agent.control.config import AskConfig
-from iort_agent.errors import AskError, UplinkError, UploadError
+from iort_agent.errors import AskError, UploadError
 from iort_agent.files.file import read
 from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.rate_limiter import STEADY
-from iort_agent.mqtt.uplink import Link, MqttMessage
+from iort_agent.mqtt.requests import Pending, Requests
+from iort_agent.mqtt.uplink import Link
 from iort_agent.ros1.json_message import decode, encode
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError, MessageError
@@ -41,8 +41,6 @@ from iort_contract.messages.questions import (
 )
 from iort_contract.topics import ANSWER, ASK
 
-_log = logging.getLogger(__name__)
-
 # Why there is no answer, beside the cloud's reasons.
 NO_ANSWER, NOT_CONNECTED = "no_answer", "not_connected"
 # How long a question waits before it asks again for room in the rate limiter.
@@ -52,26 +50,6 @@ STRING = "std_msgs/String"
 _MOST_WAITING = 8
 # The name of a question, its configuration, and the text that was published; None ends the thread.
 _Asked = Tuple[str, AskConfig, str]
-
-
-class _Wait:
-    """A question that waits: ``ended`` is set with its answer, or with why there will be none."""
-
-    def __init__(self) -> None:
-        self.ended = threading.Event()
-        self.answer: Answer | None = None
-        self.failed: AskError | None = None
-
-    def fail(self, why: str) -> None:
-        """End the wait, unless it has ended."""
-        if not self.ended.is_set():
-            self.failed = AskError(NO_ANSWER, why)
-            self.ended.set()
-
-    def published(self, error: UplinkError | None) -> None:
-        """Note the outcome of the publish."""
-        if error is not None:
-            self.fail(f"the question was not sent: {error}")
 
 
 class Questions:
@@ -90,55 +68,40 @@ class Questions:
     ) -> None:
         self._link, self._clock = link, link.clock
         self._uploader, self._download, self._offset = uploader, download, offset
-        self._lock = threading.Lock()
-        self._waits: dict[str, _Wait] = {}
-        self._halted = False
-        self._answers = f"{ANSWER}/{link.namespace}/{link.robot}/+"
-        link.uplink.subscribe(self._answers, self._on_answer)
-
-    def ready(self) -> bool:
-        """Whether a question can reach the cloud, and its answer the robot."""
-        return self._link.uplink.connected() and self._link.uplink.subscribed(self._answers)
+        self._requests = Requests(link, f"{ANSWER}/{link.namespace}/{link.robot}/+", decode_answer)
 
     def ask(self, name: str, body: Mapping[str, Any], timeout_s: float) -> Mapping[str, Any]:
         """The body of the answer. Raises `AskError`: when the cloud refuses, when no answer comes within
         ``timeout_s``, and at once without a connection."""
         until = self._clock.monotonic() + timeout_s
-        if not self.ready():
+        if not self._requests.ready():
             raise AskError(NOT_CONNECTED, "the robot is not connected to the cloud")
-        request_id, wait = uuid.uuid4().hex, _Wait()
-        with self._lock:
-            if self._halted:
-                raise AskError(NO_ANSWER, "the agent ends")
-            self._waits[request_id] = wait
-        # Also ends an upload that takes too long.
-        timer = later(timeout_s, lambda: wait.fail(f"no answer within {timeout_s:g} s"))
-        try:
-            payload = self._encoded(request_id, body, until, wait)
-            topic = self._link.topic(ASK, name)
-            while not self._link.rate_limiter.may_go(STEADY, topic, len(payload)):
-                if self._clock.wait(wait.ended, _NO_ROOM_S):
-                    break
-            else:
-                self._link.publish(topic, payload, qos=1, done=wait.published)
-                self._clock.wait(wait.ended, None)
-        finally:
-            timer.cancel()
-            with self._lock:
-                del self._waits[request_id]
+        request_id = uuid.uuid4().hex
+        with self._requests.pending(request_id) as wait:
+            # Also ends an upload that takes too long.
+            timer = later(timeout_s, lambda: wait.end(f"no answer within {timeout_s:g} s"))
+            try:
+                payload = self._encoded(request_id, body, until, wait)
+                topic = self._link.topic(ASK, name)
+                while not self._link.rate_limiter.may_go(STEADY, topic, len(payload)):
+                    if self._clock.wait(wait.ended, _NO_ROOM_S):
+                        break
+                else:
+                    self._link.publish(topic, payload, qos=1, done=wait.published)
+                    self._clock.wait(wait.ended, None)
+            finally:
+                timer.cancel()
         if wait.answer is None:
-            raise wait.failed or AskError(NO_ANSWER, "no answer")
+            raise AskError(NO_ANSWER, wait.why)
         return self._body(wait.answer.body)
 
     def halt(self) -> None:
         """Let all questions fail that wait or are to come."""
-        with self._lock:
-            self._halted = True
-            waits = list(self._waits.values())
-        for wait in waits:
-            wait.fail("the agent ends")
+        self._requests.halt("the agent ends")
 
-    def _encoded(self, request_id: str, body: Mapping[str, Any], until: float, wait: _Wait) -> bytes:
+    def _encoded(
+        self, request_id: str, body: Mapping[str, Any], until: float, wait: Pending[Answer]
+    ) -> bytes:
         """The question's message; raises `AskError`."""
         try:
             text = to_json(body)
@@ -150,7 +113,7 @@ class Questions:
         except ContractError as error:
             raise AskError(INVALID, str(error)) from error
 
-    def _uploaded(self, request_id: str, text: bytes, wait: _Wait) -> Content:
+    def _uploaded(self, request_id: str, text: bytes, wait: Pending[Answer]) -> Content:
         name = PurePath(ASK_FOLDER, f"{request_id}.json")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / name
@@ -160,7 +123,7 @@ class Questions:
                 local = read(Path(folder), name, stop=wait.ended)
                 key = self._uploader.upload(local, wait.ended)
             except UploadError as error:
-                raise wait.failed or AskError(NO_ANSWER, f"the question was not uploaded: {error}") from error
+                raise AskError(NO_ANSWER, wait.why or f"the question was not uploaded: {error}") from error
         return Content(key, local.file.sha256, local.file.size)
 
     def _body(self, body: Mapping[str, Any] | Content | Refusal) -> Mapping[str, Any]:
@@ -175,18 +138,6 @@ class Questions:
             return json_object(text, "the answer")
         except (OSError, http.client.HTTPException, ValueError) as error:
             raise AskError(NO_ANSWER, f"the answer's file cannot be read: {error}") from error
-
-    def _on_answer(self, message: MqttMessage) -> None:
-        try:
-            answer = decode_answer(message.payload)
-        except ContractError as error:
-            _log.warning("an answer on %s cannot be read: %s", message.topic, error)
-            return
-        with self._lock:
-            wait = self._waits.get(answer.id)
-        if wait is not None and not wait.ended.is_set():
-            wait.answer = answer
-            wait.ended.set()
 
 
 def asked_on(name: str) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import enum
 import http.client
-import logging
 import random
 import re
 import ssl
@@ -21,7 +20,8 @@ from urllib.parse import urlsplit
 from iort_agent.common.threads import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import LocalFile, changed, look_at, unreadable
-from iort_agent.mqtt.uplink import Link, MqttMessage
+from iort_agent.mqtt.requests import Requests
+from iort_agent.mqtt.uplink import Link
 from iort_contract.limits import ContractError
 from iort_contract.messages.files import (
     MAX_ADDRESSES,
@@ -196,8 +196,6 @@ def trusting(root_ca: Path | None) -> ssl.SSLContext:
     return context
 
 
-_log = logging.getLogger(__name__)
-
 _ANSWER_S = 15.0
 _LOOK_S = 0.25
 # Tries in a row without progress, before other files have their turn.
@@ -208,63 +206,12 @@ _AGAIN_S = 300.0
 Progress = Callable[[int], None]
 
 
-class _Requests:
-    """Requests to the cloud, one at a time in each thread."""
-
-    def __init__(self, link: Link) -> None:
-        self._link, self._clock = link, link.clock
-        self._topic, self._answers = link.topic(PING, FILE), link.topic(PONG, FILE)
-        self._lock = threading.Lock()
-        self._waiting: dict[str, threading.Event] = {}
-        self._answered: dict[str, FileAnswer] = {}
-        link.uplink.subscribe(self._answers, self._on_answer)
-
-    def ready(self) -> bool:
-        """Whether a request can reach the cloud, and its answer the robot."""
-        return self._link.uplink.connected() and self._link.uplink.subscribed(self._answers)
-
-    def ask(self, request: FileRequest, stop: threading.Event) -> FileAnswer | None:
-        """The answer to a request; None if it does not come in time. Each request has an id of its own.
-
-        Raises `UploadError` for a request that the contract does not allow.
-        """
-        try:
-            payload = encode_file_request(request)
-        except ContractError as error:
-            raise UploadError(str(error), again_s=None) from error
-        heard = threading.Event()
-        with self._lock:
-            self._waiting[request.id] = heard
-        try:
-            self._link.publish(self._topic, payload, qos=1)
-            until = self._clock.monotonic() + _ANSWER_S
-            while not stop.is_set() and self._clock.monotonic() < until:
-                if self._clock.wait(heard, _LOOK_S):
-                    break
-        finally:
-            with self._lock:
-                del self._waiting[request.id]
-                answer = self._answered.pop(request.id, None)
-        return answer
-
-    def _on_answer(self, message: MqttMessage) -> None:
-        try:
-            answer = decode_file_answer(message.payload)
-        except ContractError as error:
-            _log.warning("an answer about a file cannot be read: %s", error)
-            return
-        with self._lock:
-            heard = self._waiting.get(answer.id)
-            if heard is not None:
-                self._answered[answer.id] = answer
-                heard.set()
-
-
 class Uploader:
     """Uploads files, one at a time."""
 
     def __init__(self, link: Link, sender: Sender, *, chance: random.Random | None = None) -> None:
-        self._requests, self._sender, self._clock = _Requests(link), sender, link.clock
+        self._link, self._sender, self._clock = link, sender, link.clock
+        self._requests = Requests(link, link.topic(PONG, FILE), decode_file_answer)
         self._chance = chance or random.Random()  # noqa: S311 - jitter, not secrets
         self.ready = self._requests.ready
 
@@ -289,7 +236,7 @@ class Uploader:
                 self._clock.wait(stop, _LOOK_S)
                 continue
             before = len(transfer.there)
-            answer = self._requests.ask(transfer.request(), stop)
+            answer = self._ask(transfer.request(), stop)
             if answer is None:
                 why = "no answer from the cloud"
             elif answer.refused is not None:
@@ -308,6 +255,21 @@ class Uploader:
             ceiling = min(_MAX_RETRY_S, _MIN_RETRY_S * 2**tries)
             self._clock.wait(stop, _MIN_RETRY_S + self._chance.random() * (ceiling - _MIN_RETRY_S))
         raise UploadError(f"{local.path}: stopped", again_s=0)
+
+    def _ask(self, request: FileRequest, stop: threading.Event) -> FileAnswer | None:
+        """The answer to a request; None if it does not come in time. Raises `UploadError` for a request that
+        the contract does not allow."""
+        try:
+            payload = encode_file_request(request)
+        except ContractError as error:
+            raise UploadError(str(error), again_s=None) from error
+        with self._requests.pending(request.id) as wait:
+            self._link.publish(self._link.topic(PING, FILE), payload, qos=1)
+            until = self._clock.monotonic() + _ANSWER_S
+            while not stop.is_set() and self._clock.monotonic() < until:
+                if self._clock.wait(wait.ended, _LOOK_S):
+                    break
+        return wait.answer
 
     def _send(
         self, transfer: _Transfer, answer: FileAnswer, stop: threading.Event, progress: Progress
