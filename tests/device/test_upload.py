@@ -271,7 +271,7 @@ def test_a_malformed_answer_is_logged_and_the_next_one_used(rig, small, odd, cap
 
     rig.uplink.subscribe(build_topic(PING, "car", FILE), on_request)
     assert rig.store.objects[rig.upload(small)] == b"driven well"
-    assert "an answer about a file cannot be read" in caplog.text
+    assert "pong/iort/car/file cannot be read" in caplog.text
 
 
 def test_the_rate_is_limited(tmp_path):

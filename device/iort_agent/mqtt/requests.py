@@ -43,7 +43,8 @@ class Requests(Generic[AnswerT]):
     """The requests of one kind. Made before the uplink starts; safe to use from several threads."""
 
     def __init__(self, link: Link, answers: str, decode: Callable[[bytes], AnswerT]) -> None:
-        self._uplink, self._answers, self._decode = link.uplink, answers, decode
+        self._uplink, self._answers = link.uplink, answers
+        self._decode: Callable[[bytes], AnswerT] = decode
         self._lock = threading.Lock()
         self._pending: dict[str, Pending[AnswerT]] = {}
         self._halted = ""

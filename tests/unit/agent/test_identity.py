@@ -148,10 +148,7 @@ def test_swapped_files_are_named_also_by_the_running_agent_and_of_a_claim(tmp_pa
     for name, content in files.items():
         (tmp_path / name).write_text(content)
     for named, why in (
-        (
-            ("k.key", "c.pem"),
-            r"certificate: \S+/k.key holds no PEM certificate, and c.pem .* swapped\?",
-        ),
+        (("k.key", "c.pem"), r"certificate: \S+/k.key holds no PEM certificate, and c.pem .* swapped\?"),
         (("c.pem", "empty"), r"private_key: \S+/empty holds no PEM private key$"),
         (("c.pem", "missing"), r"/missing: cannot be read: No such file"),
         (("c.pem", "other.key"), r"/other.key is not the key of \S+/c.pem"),

@@ -38,13 +38,7 @@ def failed(name: str = HUNG_UP, code: Any = None) -> Any:
         (failed(CLOSED), GOOD, True, (f"hangup {CLOSED}", False), "again and again"),
         (failed(code=REFUSED), GOOD, False, ("refused", True), "not attached to a thing named car7"),
         (failed(HUNG_UP), GOOD._replace(not_after_s=NOW_S - 1), False, ("validity", True), "expired on 2023"),
-        (
-            failed(code=REFUSED),
-            GOOD._replace(not_before_s=NOW_S + 1),
-            True,
-            ("validity", True),
-            "set the clock",
-        ),
+        (failed(code=REFUSED), GOOD._replace(not_before_s=NOW_S + 1), True, ("validity", True), "the clock"),
         # The certificate cannot be the reason, so it is not read.
         (failed(DNS), GOOD._replace(not_after_s=NOW_S - 1), True, ("", False), "resolve"),
         (failed(code=REFUSED), None, False, ("refused", True), "iort-agent check"),

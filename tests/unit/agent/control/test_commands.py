@@ -391,10 +391,7 @@ def stick(**change: Any) -> dict[str, Any]:
         ({"ask": {"Calibration": {}}}, "ask"),
         ({"ask": {"a/b": {}}}, "ask"),
         ({"ask": {"calibration": {"timeout_s": 61}}}, "ask"),
-        (
-            stick(steering="pose.position.w"),
-            "downlink.drive: pose.position.w: geometry_msgs/Point has no such field",
-        ),
+        (stick(steering="pose.position.w"), "drive: pose.position.w: geometry_msgs/Point has no such field"),
         (stick(max_speed_mps=0), "max_speed_mps: must be a number from 0.01"),
         (stick(speed="pose.0"), "must not be an array"),
         (stick(speed="pose.__proto__.x"), "nor begin with _"),

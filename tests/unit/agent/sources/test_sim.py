@@ -450,25 +450,13 @@ def test_an_intermittent_can_loses_its_share_of_the_samples_in_gaps_and_no_poses
 @pytest.mark.parametrize(
     ("fault", "error"),
     [
-        (
-            {"kind": "worn_batery"},
-            r"faults\[0\].kind: must be one of worn_battery, .*did you mean worn_battery\?",
-        ),
+        ({"kind": "worn_batery"}, r"faults\[0\].kind: must be one of .*did you mean worn_battery\?"),
         ({}, r"faults\[0\].kind: required"),
-        (
-            {"kind": "payload", "strength": "huge"},
-            r"strength: must be weak, middle, strong or a number .*'huge'",
-        ),
+        ({"kind": "payload", "strength": "huge"}, r"strength: must be weak, middle, .* or a number .*'huge'"),
         ({"kind": "payload", "strength": -1}, r"strength: must be weak"),
         ({"kind": "flat_tyre", "strength": 0.9}, r"strength: must be at most 0.5 for flat_tyre, got 0.9"),
-        (
-            {"kind": "payload", "field": "speed"},
-            r"field: only sensor_stuck and sensor_drift have a field, got payload",
-        ),
-        (
-            {"kind": "sensor_drift", "field": "speed"},
-            r"field: must be one of voltage_input, .* for sensor_drift",
-        ),
+        ({"kind": "payload", "field": "speed"}, r"only sensor_stuck and sensor_drift have a field, got"),
+        ({"kind": "sensor_drift", "field": "speed"}, r"must be one of voltage_input, .* for sensor_drift"),
         ({"kind": "sensor_stuck", "field": "x"}, r"field: must be one of current_input"),
         ({"kind": "payload", "from_s": -1}, r"from_s: must be a number from 0"),
     ],
