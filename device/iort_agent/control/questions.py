@@ -69,12 +69,13 @@ class Questions:
         self._link, self._clock = link, link.clock
         self._uploader, self._download, self._offset = uploader, download, offset
         self._requests = Requests(link, f"{ANSWER}/{link.namespace}/{link.robot}/+", decode_answer)
+        self.ready = self._requests.ready
 
     def ask(self, name: str, body: Mapping[str, Any], timeout_s: float) -> Mapping[str, Any]:
         """The body of the answer. Raises `AskError`: when the cloud refuses, when no answer comes within
         ``timeout_s``, and at once without a connection."""
         until = self._clock.monotonic() + timeout_s
-        if not self._requests.ready():
+        if not self.ready():
             raise AskError(NOT_CONNECTED, "the robot is not connected to the cloud")
         request_id = uuid.uuid4().hex
         with self._requests.pending(request_id) as wait:

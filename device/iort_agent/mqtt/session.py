@@ -1,136 +1,103 @@
-"""MQTT 5 by hand, for `iort-agent check`: over a socket whose every step has been checked, and which says why
-the broker refuses. The running agent uses AWS' client."""
+"""One connection to the broker that does not come back, for the verbs: it says why it failed."""
 
 from __future__ import annotations
 
-import contextlib
-import socket
-import struct
+import queue
+import threading
 import time
-from types import TracebackType
+from pathlib import Path
+from typing import Any
 
-CONNECT, CONNACK, PUBLISH, SUBSCRIBE, SUBACK, DISCONNECT = 1, 2, 3, 8, 9, 14
-_KEEP_ALIVE_S = 30
-_CLEAN_START = 2
-# Reason codes from here on are refusals.
-_FIRST_REFUSAL = 0x80
-# Of a packet's length, in MQTT 5; and of an answer's body, which ends with its properties or its codes.
-_MOST_LENGTH_BYTES, _LEAST_BYTES = 4, 3
-# The codes that a robot may get.
-_REASONS = {
-    0x80: "unspecified error",
-    0x81: "malformed packet",
-    0x85: "client id not valid",
-    0x87: "not authorized",
-    0x88: "server unavailable",
-    0x89: "server busy",
-    0x8E: "another client took over this name",
-}
+from awscrt import mqtt5
+from awsiot import mqtt5_client_builder
+
+from iort_agent.mqtt.failures import code_name, explain, said
+
+# So late that this connection does not come back.
+_NEVER_MS = 60_000
 
 
 class RefusalError(Exception):
     """The broker has answered, and its answer is no."""
 
 
-class ForeignError(OSError):
-    """The other side speaks something else than MQTT 5."""
-
-
 class Session:
-    """A session over an open socket. Its methods raise `OSError` if the socket fails, and `RefusalError`."""
+    """A session of a client, which ends with its connection."""
 
-    def __init__(self, connected: socket.socket) -> None:
-        self._socket = connected
-
-    def __enter__(self) -> Session:  # noqa: PYI034 - Self came with Python 3.11
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    def __init__(
+        self,
+        client_id: str,
+        certificate: bytes,
+        private_key: bytes,
+        *,
+        endpoint: str,
+        port: int,
+        root_ca: Path | None,
     ) -> None:
-        with contextlib.suppress(OSError):
-            self._send(DISCONNECT << 4, b"")
-        self._socket.close()
+        self._ended, self._stopped = threading.Event(), threading.Event()
+        self._connected = False
+        self._messages: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+        # Why the broker did not accept; what it said, if it answered; the client's error, if it did not.
+        self.failure, self.refusal, self.error = "no answer", "", ""
+        self.client: Any = mqtt5_client_builder.mtls_from_bytes(
+            certificate,
+            private_key,
+            endpoint=endpoint,
+            port=port,
+            ca_filepath=None if root_ca is None else str(root_ca),
+            client_id=client_id,
+            session_behavior=mqtt5.ClientSessionBehaviorType.CLEAN,
+            min_reconnect_delay_ms=_NEVER_MS,
+            max_reconnect_delay_ms=_NEVER_MS,
+            on_publish_received=self._on_publish,
+            on_lifecycle_connection_success=self._on_success,
+            on_lifecycle_connection_failure=self._on_failure,
+            on_lifecycle_stopped=lambda _: self._stopped.set(),
+        )
 
-    def connect(self, client_id: str) -> None:
-        """Start a session that ends with the connection."""
-        head = _text("MQTT") + bytes([5, _CLEAN_START]) + struct.pack(">HB", _KEEP_ALIVE_S, 0)
-        try:
-            self._send(CONNECT << 4, head + _text(client_id))
-        except OSError:
-            # The server's reason, such as a TLS alert, may have come before.
-            self._read(1)
-            raise
-        self._accepted(self._receive(CONNACK)[1])
+    def open(self, timeout_s: float) -> bool:
+        """Connect; whether the broker accepted."""
+        self.client.start()
+        return self._ended.wait(timeout_s) and self._connected
 
-    def subscribe(self, topic: str) -> None:
-        """Subscribe to a topic, with QoS 0."""
-        # Packet id 1, which is free again with each answer; no properties.
-        self._send(SUBSCRIBE << 4 | 2, b"\x00\x01\x00" + _text(topic) + b"\x00")
-        self._accepted(self._receive(SUBACK)[-1])
+    def close(self, timeout_s: float = 30.0) -> None:
+        """Disconnect, or give up connecting."""
+        self.client.stop()
+        self._stopped.wait(timeout_s)
+
+    def subscribe(self, topic: str, timeout_s: float) -> None:
+        """Subscribe to a topic. Raises `RefusalError`, and what the client raises without an answer."""
+        packet = mqtt5.SubscribePacket([mqtt5.Subscription(topic, mqtt5.QoS.AT_LEAST_ONCE)])
+        (code,) = self.client.subscribe(packet).result(timeout_s).reason_codes
+        if code >= mqtt5.SubackReasonCode.UNSPECIFIED_ERROR:
+            raise RefusalError(code_name(code))
 
     def round_trip(self, topic: str, payload: bytes, answer_topic: str, timeout_s: float) -> bytes | None:
-        """Publish a message, with QoS 0, and return the next one on a topic; None without one in time."""
-        self._send(PUBLISH << 4, _text(topic) + b"\x00" + payload)
-        deadline = time.monotonic() + timeout_s
-        try:
-            while (left_s := deadline - time.monotonic()) > 0:
-                self._socket.settimeout(left_s)
-                body = self._receive(PUBLISH)
-                end = 2 + struct.unpack_from(">H", body)[0]
-                if body[2:end] == answer_topic.encode():
-                    length, start = _varint(body, end)
-                    return body[start + length :]
-        except socket.timeout:
-            pass
+        """Publish a message, and return the next one on a topic; None without one in time."""
+        until = time.monotonic() + timeout_s
+        self.client.publish(mqtt5.PublishPacket(topic=topic, payload=payload, qos=mqtt5.QoS.AT_MOST_ONCE))
+        while (left_s := until - time.monotonic()) > 0:
+            try:
+                answered, answer = self._messages.get(timeout=left_s)
+            except queue.Empty:
+                break
+            if answered == answer_topic:
+                return answer
         return None
 
-    def _accepted(self, code: int) -> None:
-        if code >= _FIRST_REFUSAL:
-            raise RefusalError(_REASONS.get(code, f"reason {code:#x}"))
+    def _on_publish(self, data: Any) -> None:
+        packet = data.publish_packet
+        self._messages.put((packet.topic, bytes(packet.payload or b"")))
 
-    def _send(self, first: int, body: bytes) -> None:
-        length, size = b"", len(body)
-        while size > 127:
-            length, size = length + bytes([size & 127 | 128]), size >> 7
-        self._socket.sendall(bytes([first]) + length + bytes([size]) + body)
+    def _on_success(self, _: Any) -> None:
+        self._connected = True
+        self._ended.set()
 
-    def _receive(self, kind: int) -> bytes:
-        """The body of the next packet of this kind; others are skipped."""
-        while True:
-            first = self._read(1)[0] >> 4
-            length = b""
-            while not length or length[-1] & 128:
-                length += self._read(1)
-                if len(length) > _MOST_LENGTH_BYTES:
-                    raise ForeignError
-            body = self._read(_varint(length, 0)[0])
-            if first == kind:
-                if len(body) < _LEAST_BYTES:
-                    raise ForeignError
-                return body
-            if first == DISCONNECT:
-                self._accepted(body[0] if body else 0)
-
-    def _read(self, count: int) -> bytes:
-        data = b""
-        while len(data) < count:
-            more = self._socket.recv(count - len(data))
-            if not more:
-                raise ConnectionResetError("the broker hangs up")
-            data += more
-        return data
-
-
-def _text(text: str) -> bytes:
-    return struct.pack(">H", len(text.encode())) + text.encode()
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """A number of MQTT's variable length, and the place behind it."""
-    value = shift = 0
-    while True:
-        value |= (data[at] & 127) << shift
-        at, shift = at + 1, shift + 7
-        if not data[at - 1] & 128:
-            return value, at
+    def _on_failure(self, data: Any) -> None:
+        packet = data.connack_packet
+        self.failure = said(packet) if packet is not None else explain(data.exception)
+        if packet is not None:
+            self.refusal = code_name(packet.reason_code)
+        else:
+            self.error = str(getattr(data.exception, "name", data.exception))
+        self._ended.set()

@@ -12,10 +12,11 @@ import socket
 import ssl
 import time
 import uuid
+from concurrent.futures import TimeoutError as FutureTimeout
 from contextlib import closing, suppress
 from email.utils import parsedate_to_datetime
 from ipaddress import ip_address
-from typing import Any, Generator, Iterator, NamedTuple
+from typing import TYPE_CHECKING, Any, Generator, Iterator, NamedTuple
 from urllib.parse import urlsplit
 
 from iort_agent.common.state import Status
@@ -23,14 +24,20 @@ from iort_agent.config import Config
 from iort_agent.errors import IdentityError
 from iort_agent.files.upload import trusting
 from iort_agent.identity import Certificate, check_pair
-from iort_agent.mqtt.session import ForeignError, RefusalError, Session
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_contract.limits import ContractError
 from iort_contract.messages.files import File, FileRequest, decode_file_answer, encode_file_request
 from iort_contract.messages.live import decode_pong, encode_ping
 from iort_contract.topics import FILE, PING, PONG, RULE, build_topic
 
+if TYPE_CHECKING:
+    from iort_agent.mqtt.session import Session
+
 TIMEOUT_S = 5.0
+# A server that refuses our certificate says so within a round trip.
+_ALERT_S = 1.0
+# The client's errors for an answer that is not MQTT 5.
+_FOREIGN = ("AWS_ERROR_MQTT5_DECODE_PROTOCOL_ERROR", "AWS_ERROR_MQTT5_PROTOCOL_ERROR")
 SET_CLOCK = "set the clock: `timedatectl set-ntp true`, or `sudo date -s ...`"
 # The port of HTTPS, on which AWS' broker wants ALPN.
 _HTTPS_PORT = 443
@@ -168,12 +175,14 @@ def check_connection(config: Config, running: Status | None = None) -> Iterator[
         with closing(raw), closing(secured(config, raw, address)) as secure:
             yield _served(secure)
             if running is None:
-                offset = yield from _broker(config, secure)
+                _trusted(config, secure)
             elif running.connection.connected:
                 yield Finding("broker", OK, "the running agent is connected")
             else:
                 why = running.connection.last_error
                 yield Finding("broker", FAIL, f"the running agent is not connected: {why}")
+        if running is None:
+            offset = yield from _broker(config)
     except BlockedError as blocked:
         yield blocked.finding
     yield _clock(offset or _other_offset(config, running))
@@ -259,28 +268,38 @@ def _served(secure: ssl.SSLSocket) -> Finding:
     return Finding("server certificate", OK, text)
 
 
-def _broker(config: Config, secure: ssl.SSLSocket) -> Generator[Finding, None, _Offset | None]:
+def _trusted(config: Config, secure: ssl.SSLSocket) -> None:
+    """Raise `BlockedError` if the server refuses our certificate: with TLS 1.3 its alert comes only now."""
+    secure.settimeout(_ALERT_S)
+    try:
+        secure.recv(1)
+    except socket.timeout:
+        return
+    except OSError as error:
+        if (refused := refused_ours(config, str(getattr(error, "reason", None) or error))) is not None:
+            raise BlockedError("broker", *refused) from error
+
+
+def _broker(config: Config) -> Generator[Finding, None, _Offset | None]:
     """The broker's answer to the robot, then the cloud's. Returns the clock's offset, or None."""
-    robot = config.robot
-    with Session(secure) as session:
-        try:
-            session.connect(robot)
-        except RefusalError as refusal:
-            todo = (
-                f"the certificate is not active, not attached to the thing {robot}, or its policy refuses: "
-                "see `iort robots list`"
-            )
-            raise BlockedError("broker", f"refuses {robot}: {refusal}", todo) from refusal
-        except OSError as error:
-            raise BlockedError("broker", *_no_connack(config, error)) from error
+    # It loads the network's library.
+    from iort_agent.mqtt.session import RefusalError, Session  # noqa: PLC0415 - see above
+
+    robot, certificate, key = config.robot, config.certificate.read_bytes(), config.private_key.read_bytes()
+    session = Session(
+        robot, certificate, key, endpoint=config.endpoint, port=config.port, root_ca=config.root_ca
+    )
+    try:
+        if not session.open(TIMEOUT_S):
+            raise BlockedError("broker", *_not_accepted(config, session))
         yield Finding("broker", OK, f"accepts {robot}")
         try:
-            session.subscribe(build_topic(PONG, robot, RULE, config.namespace))
-            session.subscribe(build_topic(PONG, robot, FILE, config.namespace))
+            for lane in (RULE, FILE):
+                session.subscribe(build_topic(PONG, robot, lane, config.namespace), TIMEOUT_S)
             offset = _ping(config, session)
             yield Finding("rules", OK, f"answer a ping, {offset.by}")
             yield _files(config, session)
-        except (OSError, RefusalError, ContractError) as error:
+        except (OSError, FutureTimeout, RefusalError, ContractError) as error:
             todo = (
                 f"is `namespace: {config.namespace}` the deployment's, and is it deployed whole? "
                 "`iort doctor` there"
@@ -288,6 +307,8 @@ def _broker(config: Config, secure: ssl.SSLSocket) -> Generator[Finding, None, _
             yield Finding("rules", WARN, f"the cloud's rules do not answer: {error}", todo)
             return None
         return offset
+    finally:
+        session.close(TIMEOUT_S)
 
 
 def _ping(config: Config, session: Session) -> _Offset:
@@ -328,21 +349,25 @@ def _files(config: Config, session: Session) -> Finding:
     return Finding("files", OK, f"could be sent to {host}:{port}")
 
 
-def _no_connack(config: Config, error: OSError) -> tuple[str, str]:
-    # With TLS 1.3 the server's opinion of our certificate comes only now.
-    refused = refused_ours(config, str(getattr(error, "reason", None) or error))
-    if refused is not None:
-        return refused
-    if isinstance(error, ForeignError):
+def _not_accepted(config: Config, session: Session) -> tuple[str, str]:
+    """Why the broker did not accept the robot, and what to do."""
+    robot = config.robot
+    if session.refusal:
+        todo = (
+            f"the certificate is not active, not attached to the thing {robot}, or its policy refuses: "
+            "see `iort robots list`"
+        )
+        return f"refuses {robot}: {session.refusal}", todo
+    if not session.error:
+        return f"gives {robot} no answer in {TIMEOUT_S:g} s", _HANGS
+    if session.error in _FOREIGN:
         todo = "is `port` right? The cloud's broker speaks MQTT 5, older ones do not"
         return "answers, but not in MQTT 5", todo
-    if isinstance(error, socket.timeout):
-        return f"gives {config.robot} no answer in {TIMEOUT_S:g} s", _HANGS
     todo = (
         "the certificate is unknown there, not active or revoked (`iort robots list`), or the broker is "
         "being restarted: try again"
     )
-    return f"hangs up on {config.robot}: {error}", todo
+    return f"hangs up on {robot}: {session.failure}", todo
 
 
 def _other_offset(config: Config, running: Status | None) -> _Offset | None:

@@ -9,12 +9,11 @@ import contextlib
 import json
 import logging
 import re
-import threading
 import time
 import uuid
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePath
-from typing import Any, Callable, Mapping
+from typing import TYPE_CHECKING, Any, Callable, Mapping
 
 from iort_agent.common.private_files import open_below, write_below
 from iort_agent.common.schema import FILE, Place, load, number, path, read_yaml, setting, text
@@ -24,6 +23,9 @@ from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
 from iort_contract.topics import check_namespace, check_robot
+
+if TYPE_CHECKING:
+    from iort_agent.mqtt.session import Session
 
 _log = logging.getLogger(__name__)
 
@@ -134,55 +136,6 @@ def read_pending(folder: Path) -> Pending | None:
         return None
 
 
-class _Connection:
-    """A connection to the broker that does not reconnect."""
-
-    def __init__(self, claim: Claim, certificate: bytes, private_key: bytes, client_id: str) -> None:
-        # Reading a configuration must not need the network's library.
-        from awscrt import mqtt5  # noqa: PLC0415 - see above
-        from awsiot import mqtt5_client_builder  # noqa: PLC0415 - as above
-
-        self._ended = threading.Event()
-        self._stopped = threading.Event()
-        self._connected = False
-        self.failure = "no answer"
-        self.client: Any = mqtt5_client_builder.mtls_from_bytes(
-            certificate,
-            private_key,
-            endpoint=claim.endpoint,
-            port=claim.port,
-            ca_filepath=None if claim.root_ca is None else str(claim.root_ca),
-            client_id=client_id,
-            session_behavior=mqtt5.ClientSessionBehaviorType.CLEAN,
-            min_reconnect_delay_ms=60_000,
-            max_reconnect_delay_ms=60_000,
-            on_lifecycle_connection_success=self._on_success,
-            on_lifecycle_connection_failure=self._on_failure,
-            on_lifecycle_stopped=lambda _: self._stopped.set(),
-        )
-
-    def open(self) -> bool:
-        """Connect; whether the broker accepted."""
-        self.client.start()
-        return self._ended.wait(_WAIT_S) and self._connected
-
-    def close(self) -> None:
-        """Disconnect, or give up connecting."""
-        self.client.stop()
-        self._stopped.wait(_WAIT_S)
-
-    def _on_success(self, _: Any) -> None:
-        self._connected = True
-        self._ended.set()
-
-    def _on_failure(self, data: Any) -> None:
-        from iort_agent.mqtt.failures import explain, said  # noqa: PLC0415 - it loads the network's library
-
-        packet = data.connack_packet
-        self.failure = said(packet) if packet is not None else explain(data.exception)
-        self._ended.set()
-
-
 class Exchange:
     """The connection with a claim, open within a `with`."""
 
@@ -195,11 +148,9 @@ class Exchange:
             raise IdentityError(f"the claim: {error}") from error
         self._claim = claim
         self._template = fleet_name(claim.namespace)
-        self._connection = _Connection(
-            claim,
-            claim.certificate.read_bytes(),
-            claim.private_key.read_bytes(),
-            f"{claim_name(claim.namespace)}-{uuid.uuid4().hex[:8]}",
+        client_id = f"{claim_name(claim.namespace)}-{uuid.uuid4().hex[:8]}"
+        self._connection = self._session(
+            client_id, claim.certificate.read_bytes(), claim.private_key.read_bytes()
         )
         self._requests: Any = None
 
@@ -207,7 +158,7 @@ class Exchange:
         from awscrt import mqtt_request_response  # noqa: PLC0415 - the network's library
         from awsiot import iotidentity  # noqa: PLC0415 - the network's library
 
-        if not self._connection.open():
+        if not self._connection.open(_WAIT_S):
             self.__exit__()
             raise IdentityError(
                 f"the claim does not connect: {self._connection.failure}. Most claims live for minutes "
@@ -248,11 +199,25 @@ class Exchange:
 
         It ends a session that the robot has, as the robot's agent would.
         """
-        connection = _Connection(self._claim, certificate.encode(), private_key.encode(), robot)
+        connection = self._session(robot, certificate.encode(), private_key.encode())
         try:
-            return connection.open()
+            return connection.open(_WAIT_S)
         finally:
             connection.close()
+
+    def _session(self, client_id: str, certificate: bytes, private_key: bytes) -> Session:
+        # Reading a claim must not need the network's library.
+        from iort_agent.mqtt.session import Session  # noqa: PLC0415 - see above
+
+        claim = self._claim
+        return Session(
+            client_id,
+            certificate,
+            private_key,
+            endpoint=claim.endpoint,
+            port=claim.port,
+            root_ca=claim.root_ca,
+        )
 
 
 def _result(what: str, future: Any) -> Any:
