@@ -11,7 +11,6 @@ from pathlib import PurePath
 import pytest
 
 from iort_agent.common.state import Files
-from iort_agent.common.threads import Supervised
 from iort_agent.config import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
@@ -30,7 +29,6 @@ from iort_contract.messages.files import (
 )
 from iort_contract.topics import FILE, PING, build_topic
 from testkit.agent import Loopback, ManualClock, link_of
-from testkit.waiting import GUARD_S
 from tests.store_standin import store
 from tests.unit.agent.test_agent import config_file
 
@@ -422,28 +420,6 @@ def test_a_file_with_an_unexpected_error_does_not_delay_others(rig, bags):
         uploads.step(rig.stop)
     assert uploads.step(rig.stop)
     assert list(rig.store.objects.values()) == [b"second.bag"]
-
-
-def test_an_unexpected_error_does_not_end_the_uploads(rig, bags, caplog):
-    (bags / "a.bag").write_bytes(b"1")
-    uploads = rig.folder(bags, settle_s=0)
-    step, calls = uploads.step, []
-
-    def odd(stop):
-        calls.append(1)
-        if len(calls) == 1:
-            raise RuntimeError("odd")
-        step(stop)
-        rig.stop.set()
-        return True
-
-    uploads.step = odd
-    thread = Supervised("uploads", lambda: uploads.run(rig.stop))
-    thread.start()
-    assert rig.stop.wait(GUARD_S)
-    thread.join(GUARD_S)
-    assert "the thread uploads failed and starts again" in caplog.text
-    assert list(rig.store.objects.values()) == [b"1"]
 
 
 def test_the_command_gives_advice_while_an_agent_runs(tmp_path, bags):

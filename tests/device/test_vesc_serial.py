@@ -65,15 +65,6 @@ def test_a_controller_behind_the_can_bus_is_read(vesc: VescStandin) -> None:
     assert (running.samples[0][0], running.samples[0][2]["controller_id"]) == ("rear", 17)
 
 
-@pytest.mark.parametrize("length", [54, 59, 73])
-def test_older_firmware_is_read(vesc: VescStandin, length: int) -> None:
-    vesc.length = length
-    with Running(config(vesc)) as running:
-        running.wait_for(20)
-    assert ("avg_vq" in running.samples[0][2]) == (length == 73)
-    assert running.source.counts.timeouts == 0
-
-
 def test_garbage_around_every_answer_costs_no_sample(vesc: VescStandin) -> None:
     noise = b"\x02\x03\xff\x00\x02\x4a\x04"
     vesc.answer = lambda frame, n: [noise, frame[:30], frame[30:], noise]

@@ -111,22 +111,6 @@ def test_the_running_agent_does_not_load_the_library() -> None:
     subprocess.run([sys.executable, "-c", code], input=text(certificate), text=True, check=True)
 
 
-def test_a_key_belongs_to_its_certificate(tmp_path: Path) -> None:
-    year = (dt.datetime(2020, 1, 1), dt.datetime(2040, 1, 1))  # noqa: DTZ001 - the library takes UTC for granted
-    (one, one_key), (_, other_key) = made(*year), made(*year)
-    for name, content in (("c", text(one)), ("k", one_key), ("o", other_key), ("x", "no key")):
-        (tmp_path / name).write_text(content)
-    check_pair(tmp_path / "c", tmp_path / "k")
-    with pytest.raises(IdentityError, match="is not the key of"):
-        check_pair(tmp_path / "c", tmp_path / "o")
-    with pytest.raises(IdentityError, match="x holds no PEM private key"):
-        check_pair(tmp_path / "c", tmp_path / "x")
-    with pytest.raises(IdentityError, match="cannot be read"):
-        read_certificate(tmp_path / "none")
-    with pytest.raises(IdentityError, match="no PEM certificate"):
-        read_certificate(tmp_path / "x")
-
-
 def test_a_stamp_changes_with_every_replacement(tmp_path: Path) -> None:
     file, other = tmp_path / "a", tmp_path / "b"
     assert stamp(file, None) == (None,)
@@ -147,6 +131,11 @@ def test_swapped_files_are_named_also_by_the_running_agent_and_of_a_claim(tmp_pa
     files = {"c.pem": text(certificate), "k.key": key, "other.key": of_another, "empty": ""}
     for name, content in files.items():
         (tmp_path / name).write_text(content)
+    check_pair(tmp_path / "c.pem", tmp_path / "k.key")
+    with pytest.raises(IdentityError, match="cannot be read"):
+        read_certificate(tmp_path / "none")
+    with pytest.raises(IdentityError, match="no PEM certificate"):
+        read_certificate(tmp_path / "empty")
     for named, why in (
         (("k.key", "c.pem"), r"certificate: \S+/k.key holds no PEM certificate, and c.pem .* swapped\?"),
         (("c.pem", "empty"), r"private_key: \S+/empty holds no PEM private key$"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-import struct
 import threading
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from PIL import Image
 
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
-from iort_agent.files.file import read
 from iort_agent.files.folder import FilesConfig, Folder
 from iort_agent.lanes.attachment import Attachments, thumbnail
 from iort_agent.sources.recording import BagConfig
@@ -233,19 +231,6 @@ def test_a_recording_gives_its_pictures_with_large_upload(tmp_path):
     assert [values.large for _, _, values in play(path)] == [{}, {}]
 
 
-def test_a_live_topic_gives_its_bytes_with_large_upload():
-    definition = parse("sensor_msgs/CompressedImage", "string format\nuint8[] data\nuint8 last")
-    message = struct.pack("<I4sI", 4, b"jpeg", len(PICTURE)) + PICTURE + b"\x07"
-    values = Decoder(definition, large=True).decode(message)
-    assert values == {"format": "jpeg", "data": PICTURE, "last": 7}
-    refusing = Decoder(definition)
-    assert refusing.decode(message) == {"format": "jpeg", "last": 7}
-    assert refusing.left_out == {"data": 1}
-    assert Decoder(definition, select=["format"], large=True).decode(message) == {"format": "jpeg"}
-    with pytest.raises(MessageError, match="truncated"):
-        Decoder(definition, large=True).decode(message[:100])
-
-
 CAR = """
 robot: car
 endpoint: localhost
@@ -267,10 +252,3 @@ def test_large_upload_needs_a_large_folder(tmp_path):
     file.write_text(CAR.replace("upload", "download"))
     with pytest.raises(ConfigError, match="one of refuse, upload"):
         load_config(file)
-
-
-def test_the_folder_reads_the_content_that_the_attachment_names(tmp_path):
-    attachments_in(tmp_path).attach_to_message("camera", T_US, image())
-    (path,) = tmp_path.glob("camera/*.jpg")
-    local = read(tmp_path, path.relative_to(tmp_path), stop=threading.Event())
-    assert local.file.t_us == T_US

@@ -136,35 +136,6 @@ def test_a_silent_topic_closes_its_batch_by_the_clock() -> None:
     assert len(line.batches()) == 1
 
 
-@pytest.mark.parametrize(
-    ("stamps", "batches"),
-    [
-        ([0, 0, 0], [[0, 0, 0]]),
-        ([10, 5, 11], [[5, 10, 11]]),
-        ([999_999, 10, 1_000_000], [[10, 999_999], [1_000_000]]),
-        ([3_000_000, 1_000_000, 1_000_020], [[3_000_000], [1_000_000, 1_000_020]]),
-    ],
-)
-def test_times_are_kept_and_put_in_order_within_a_batch(stamps: list[int], batches: list[list[int]]) -> None:
-    line = Line()
-    for i, stamp in enumerate(stamps):
-        line.encoder.add(T0 + stamp, {"speed": i})
-    line.encoder.flush()
-    assert [[t - T0 for t in batch.times_us] for batch in line.batches()] == batches
-    assert sorted((t - T0, values["speed"]) for t, values in line.samples()) == sorted(
-        (stamp, i) for i, stamp in enumerate(stamps)
-    )
-
-
-def test_samples_of_one_time_stay_in_the_order_in_which_they_came() -> None:
-    line = Line()
-    for i in (3, 1, 2):
-        line.encoder.add(T0 + 5, {"speed": i})
-    line.encoder.add(T0, {"speed": 0})
-    line.encoder.flush()
-    assert [values["speed"] for _, values in line.samples()] == [0, 3, 1, 2]
-
-
 @pytest.mark.parametrize("behind_us", [2_000_000, 2_500_000, 700_000])
 def test_clocks_that_interleave_take_no_more_batches_than_they_would_alone(behind_us: int) -> None:
     """Two publishers at 50 Hz, one of which is behind: a batch a second each, and not one a sample."""
@@ -192,18 +163,6 @@ def test_of_too_many_open_seconds_the_oldest_is_closed() -> None:
     assert [values["speed"] for _, values in line.samples()] == list(range(20))
 
 
-def test_a_second_that_was_closed_is_opened_again() -> None:
-    line = Line()
-    line.encoder.add(T0, {"speed": 0})
-    line.clock.advance(1.0)
-    line.encoder.add(T0 + 1_000_000, {"speed": 1})
-    assert len(line.batches()) == 1
-    line.encoder.add(T0 + 10, {"speed": 2})
-    line.encoder.flush()
-    assert [[t - T0 for t in batch.times_us] for batch in line.batches()] == [[0], [1_000_000], [10]]
-    assert len({batch.id for batch in line.batches()}) == 3
-
-
 def test_before_1970_there_is_no_sample() -> None:
     line = Line()
     line.encoder.add(-1, {"speed": 1})
@@ -224,15 +183,6 @@ def test_another_set_of_fields_is_another_message_and_not_another_second() -> No
     assert dict(both.columns) == {"a": list(range(50)), "b": [2 if i % 2 else 3 for i in range(50)]}
     assert dict(one.columns) == {"a": [None] * 50}
     assert (both.seq, one.seq) == (0, 1)
-
-
-def test_samples_without_a_field_are_samples_too() -> None:
-    line = Line()
-    for i in range(3):
-        line.encoder.add(T0 + i, {})
-    line.encoder.flush()
-    (batch,) = line.batches()
-    assert (batch.times_us, dict(batch.columns)) == ([T0, T0 + 1, T0 + 2], {})
 
 
 def test_messages_of_two_types_and_plain_samples_are_a_message_each() -> None:

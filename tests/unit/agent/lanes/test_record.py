@@ -77,14 +77,6 @@ def test_publishes_in_order_at_qos_1_on_the_basic_ingest_topic() -> None:
     assert rig.left() == 0
 
 
-def test_nothing_is_sent_without_a_connection() -> None:
-    rig = Rig()
-    rig.put(3)
-    assert rig.turn() is None
-    assert rig.sent() == []
-    assert rig.left() == 3
-
-
 def test_a_window_of_messages_waits_for_acknowledgements() -> None:
     rig = Rig(window=4)
     rig.uplink.connect()

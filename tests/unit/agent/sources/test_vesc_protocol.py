@@ -80,23 +80,6 @@ def test_a_frame_after_a_megabyte_of_start_bytes() -> None:
     assert parser.skipped == 1_000_000
 
 
-def test_no_length_of_garbage_hides_the_frame_after_it() -> None:
-    for length in range(1, 2 * vesc_protocol._MAX_BUFFER, 13):
-        parser = FrameParser()
-        for at in range(0, length, 61):
-            parser.feed(b"\xaa" * min(61, length - at))
-        assert parser.feed(framed(b"abc")) == [b"abc"]
-        assert parser.skipped == length
-
-
-def test_half_a_frame_does_not_keep_the_next_one_waiting() -> None:
-    parser = FrameParser()
-    assert parser.feed(framed(values())[:40]) == []
-    assert parser.feed(framed(values(7))) == [values(7)]
-    # Nor does a head that promises a kilobyte.
-    assert parser.feed(b"\x03\x04\x00" + framed(values(8))) == [values(8)]
-
-
 def test_wrong_crcs_are_counted() -> None:
     parser = FrameParser()
     broken, endless = bytearray(framed(values())), bytearray(framed(values()))
