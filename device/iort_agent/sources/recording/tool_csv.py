@@ -1,7 +1,8 @@
 """Reads a VESC Tool log: each row is an answer of the controller, in columns named by VESC Tool.
 
-The header tells the separator, and `tool_columns` reads the cells. A cell without a number is null, and a row
-that does not fit is skipped. Both are counted by cause, and logged once.
+The header tells the separator, and the first rows tell the decimal sign and the columns that hold numbers. A
+cell without a number is null, and a row that does not fit is skipped. Both are counted by cause, and logged
+once.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import re
 from collections import Counter
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import Any, Iterator, Mapping, NamedTuple, Sequence
+from typing import Any, Iterator, NamedTuple, Sequence
 
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.player import ORIGINAL, Message
@@ -60,96 +61,6 @@ _CONTRACT_NAMES = frozenset(_NAMES.values())
 # The controller counts these in ten-thousandths; VESC Tool divided them by 10,000.
 _TEN_THOUSANDTHS = frozenset({"charge_drawn", "charge_regen", "energy_drawn", "energy_regen"})
 
-
-class BadRowError(ValueError):
-    """A row that cannot be used, and the cause that it is counted under."""
-
-    def __init__(self, cause: str, text: str) -> None:
-        super().__init__(text)
-        self.cause = cause
-
-
-class _BadCellError(ValueError):
-    """A cell that holds no number."""
-
-
-class _Column(NamedTuple):
-    at: int
-    label: str
-    name: str
-
-
-class Columns:
-    """The columns of a log. ``bad`` are the columns of the last row whose cell holds no number, and why."""
-
-    def __init__(self, labels: Sequence[str], first_rows: Sequence[Sequence[str]]) -> None:
-        self.bad: list[tuple[str, str]] = []
-        self._time = labels.index(TIME)
-        cells = [cell for row in first_rows for cell in row]
-        commas, points = (sum(map(bool, map(sign.fullmatch, cells))) for sign in (_WITH_COMMA, _WITH_POINT))
-        self._comma = commas > points
-        columns = [
-            _Column(at, label, _NAMES.get(label, label)) for at, label in enumerate(labels) if label != TIME
-        ]
-        self.kept = [column for column in columns if self._is_field(column, first_rows)]
-        kept = {column.at for column in self.kept}
-        self.dropped = [column.label or "(no name)" for column in columns if column.at not in kept]
-
-    def time_of(self, cells: Sequence[str]) -> int:
-        """The row's time of day in milliseconds. Raises `BadRowError`."""
-        try:
-            ms_today = self._number(cells[self._time], TIME)
-        except _BadCellError as error:
-            raise BadRowError("time", str(error)) from error
-        if ms_today is None or not 0 <= ms_today < DAY_MS:
-            text = f"{TIME} must be from 0 to {DAY_MS - 1}, got {cells[self._time]!r}"
-            raise BadRowError("time", text)
-        return int(ms_today)
-
-    def sample(self, cells: Sequence[str]) -> Mapping[str, Value]:
-        """The row's sample; a cell that holds no number is null."""
-        self.bad = []
-        return {column.name: self._value(column, cells[column.at]) for column in self.kept}
-
-    def _is_field(self, column: _Column, rows: Sequence[Sequence[str]]) -> bool:
-        """Whether the column is the contract's, or has the name of a field and holds a number or nothing."""
-        if column.label in _NAMES:
-            return True
-        if not _FIELD.fullmatch(column.name) or column.name in _CONTRACT_NAMES:
-            return False
-        filled = [row[column.at] for row in rows if row[column.at]]
-        return not filled or any(_NUMBER.fullmatch(self._plain(cell)) for cell in filled)
-
-    def _value(self, column: _Column, cell: str) -> Value:
-        if column.name == "fault_code" and cell[:1].isalpha():
-            code = FAULT_CODES.get(cell[len(_FAULT_PREFIX) :] if cell.startswith(_FAULT_PREFIX) else cell)
-            if code is None:
-                self.bad.append((column.label, f"{column.label} must be a known fault, got {cell[:40]!r}"))
-            return code
-        try:
-            number = self._number(cell, column.label)
-        except _BadCellError as error:
-            self.bad.append((column.label, str(error)))
-            return None
-        if column.name in _TEN_THOUSANDTHS and number is not None and math.isfinite(number):
-            return round(number * 1e4)
-        return number
-
-    def _number(self, cell: str, label: str) -> float | None:
-        if not cell:
-            return None
-        plain = self._plain(cell)
-        if not _NUMBER.fullmatch(plain):
-            raise _BadCellError(f"{label} must be a number, got {cell[:40]!r}")
-        return int(plain) if _WHOLE.fullmatch(plain) else float(plain)
-
-    def _plain(self, cell: str) -> str:
-        # In a log with commas, a point is no decimal sign.
-        return cell.replace(".", "?").replace(",", ".") if self._comma else cell
-
-
-_log = logging.getLogger(__name__)
-
 # VESC Tool names a log by its local start time. The rows' time of day is UTC since September 2019.
 _BEGUN = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")
 _BEGUN_FORMAT = "%Y-%m-%d_%H-%M-%S"
@@ -157,6 +68,14 @@ _BEGUN_FORMAT = "%Y-%m-%d_%H-%M-%S"
 _FIRST_ROWS = 100
 # VESC Tool writes about 60 columns.
 _MAX_COLUMNS, _MAX_LINE = 4096, 256 * 1024
+
+_log = logging.getLogger(__name__)
+
+
+class _Column(NamedTuple):
+    at: int
+    label: str
+    name: str
 
 
 class VescLog:
@@ -166,7 +85,8 @@ class VescLog:
         self._path = path
         self._stream = stream
         self._stamps = stamps
-        self._told: set[str] = set()
+        self._comma = False
+        self._logged: set[str] = set()
         self._rows_read = self._clock_back = 0
         self._skipped: Counter[str] = Counter()
         self._bad_cells: Counter[str] = Counter()
@@ -208,36 +128,78 @@ class VescLog:
         rows = self._rows(lines, separator, len(labels))
         first_rows = list(islice(rows, _FIRST_ROWS))
         columns = self._columns(labels, [cells for _, cells in first_rows])
-        elapsed, base_ns = _Elapsed(), 0
+        time_at, elapsed, base_ns = labels.index(TIME), _Elapsed(), 0
         for number, cells in chain(first_rows, rows):
-            try:
-                ms_today = columns.time_of(cells)
-            except BadRowError as error:
-                self._skip(number, error)
+            ms_today, problem = self._number(cells[time_at])
+            if problem or ms_today is None or not 0 <= ms_today < DAY_MS:
+                got = cells[time_at][:40]
+                self._skip(number, "time", f"{TIME} must be a number from 0 to {DAY_MS - 1}, got {got!r}")
                 continue
-            at_ms, measured_ms = elapsed.at(ms_today)
+            at_ms, measured_ms = elapsed.at(int(ms_today))
             if elapsed.rows == 1:
-                base_ns = self._begin_ns(ms_today)
+                base_ns = self._begin_ns(int(ms_today))
             self._clock_back += measured_ms < at_ms
-            sample = columns.sample(cells)
-            for column, why in columns.bad:
-                self._bad_cells[column] += 1
-                self._once(f"cell {column}", f"row {number}: {why}: null")
+            sample: dict[str, Value] = {}
+            for column in columns:
+                sample[column.name], problem = self._value(column, cells[column.at])
+                if problem:
+                    self._bad_cells[column.label] += 1
+                    got = f"got {cells[column.at][:40]!r}: null"
+                    self._once(
+                        f"cell {column.label}", f"row {number}: {column.label} must be {problem}, {got}"
+                    )
             yield Message(self._stream, at_ms * 1_000_000, base_ns + measured_ms * 1_000_000, sample)
         if not elapsed.rows:
             raise SourceError(f"{self._path}: it has no row that can be read")
 
-    def _columns(self, labels: Sequence[str], first_rows: Sequence[Sequence[str]]) -> Columns:
-        columns = Columns(labels, first_rows)
-        self._dropped = columns.dropped
-        if len(columns.kept) > MAX_FIELDS:
+    def _columns(self, labels: Sequence[str], rows: Sequence[Sequence[str]]) -> list[_Column]:
+        """The columns that are fields: the contract's, and those that hold a number or nothing."""
+        cells = [cell for row in rows for cell in row]
+        commas, points = (sum(map(bool, map(sign.fullmatch, cells))) for sign in (_WITH_COMMA, _WITH_POINT))
+        self._comma = commas > points
+        columns, self._dropped = [], []
+        for at, label in enumerate(labels):
+            if label in _NAMES or (label != TIME and self._is_field(label, [row[at] for row in rows])):
+                columns.append(_Column(at, label, _NAMES.get(label, label)))
+            elif label != TIME:
+                self._dropped.append(label or "(no name)")
+        if len(columns) > MAX_FIELDS:
             raise SourceError(
-                f"{self._path}: {len(columns.kept)} of its columns hold numbers, and a sample has at most "
+                f"{self._path}: {len(columns)} of its columns hold numbers, and a sample has at most "
                 f"{MAX_FIELDS} fields: take columns out of the file"
             )
-        if columns.dropped:
-            self._once("dropped", f"columns that hold no numbers: {', '.join(columns.dropped)}")
+        if self._dropped:
+            self._once("dropped", f"columns that hold no numbers: {', '.join(self._dropped)}")
         return columns
+
+    def _is_field(self, name: str, cells: Sequence[str]) -> bool:
+        if not _FIELD.fullmatch(name) or name in _CONTRACT_NAMES:
+            return False
+        filled = [cell for cell in cells if cell]
+        return not filled or any(_NUMBER.fullmatch(self._plain(cell)) for cell in filled)
+
+    def _value(self, column: _Column, cell: str) -> tuple[Value, str]:
+        """A cell's value, and what it must be if it has none."""
+        if column.name == "fault_code" and cell[:1].isalpha():
+            code = FAULT_CODES.get(cell[len(_FAULT_PREFIX) :] if cell.startswith(_FAULT_PREFIX) else cell)
+            return code, "" if code is not None else "a known fault"
+        number, problem = self._number(cell)
+        if column.name in _TEN_THOUSANDTHS and number is not None and math.isfinite(number):
+            number = round(number * 1e4)
+        return number, problem
+
+    def _number(self, cell: str) -> tuple[float | None, str]:
+        """As `_value`, of a cell that is a number or empty."""
+        plain = self._plain(cell)
+        if cell and not _NUMBER.fullmatch(plain):
+            return None, "a number"
+        if not cell:
+            return None, ""
+        return int(plain) if _WHOLE.fullmatch(plain) else float(plain), ""
+
+    def _plain(self, cell: str) -> str:
+        # In a log with commas, a point is no decimal sign.
+        return cell.replace(".", "?").replace(",", ".") if self._comma else cell
 
     def _rows(
         self, lines: Iterator[tuple[int, str]], separator: str, wanted: int
@@ -251,12 +213,11 @@ class VescLog:
             if len(cells) == wanted:
                 yield number, [cell.strip() for cell in cells]
             else:
-                text = f"{len(cells)} columns, and the first line names {wanted}"
-                self._skip(number, BadRowError("columns", text))
+                self._skip(number, "columns", f"{len(cells)} columns, and the first line names {wanted}")
 
-    def _skip(self, number: int, error: BadRowError) -> None:
-        self._skipped[error.cause] += 1
-        self._once("skipped", f"row {number} is skipped: {error}")
+    def _skip(self, number: int, cause: str, why: str) -> None:
+        self._skipped[cause] += 1
+        self._once("skipped", f"row {number} is skipped: {why}")
 
     def _lines(self) -> Iterator[tuple[int, str]]:
         """The lines that are not empty, numbered as in an editor."""
@@ -312,8 +273,8 @@ class VescLog:
         return (days * DAY_MS + ms_today) * 1_000_000
 
     def _once(self, key: str, text: str) -> None:
-        if key not in self._told:
-            self._told.add(key)
+        if key not in self._logged:
+            self._logged.add(key)
             _log.warning("%s: %s", self._path, text)
 
 
