@@ -1,18 +1,15 @@
 """ROS 1 message types and the bytes of their messages, without ROS or a library.
 
 A `Message` is a type with its nested types; it has the text that a publisher sends and its checksum.
-`serialize` makes a message with values of a `Chance`, byte by byte; `fields` reads one as a flat list,
-`as_json` as rosbridge does."""
+`serialize` makes a message with values of a `Chance`, byte by byte; `fields` reads one as a flat list."""
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import math
 import re
 import struct
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 SIZES = {
     "bool": 1, "int8": 1, "uint8": 1, "byte": 1, "char": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4,
@@ -192,44 +189,6 @@ def fields(message: Message, data: bytes) -> list[tuple[str, object]]:
     else:
         if end != len(data):
             found.append(("too long", len(data) - end))
-    return found
-
-
-def as_json(message: Message, data: bytes) -> dict[str, Any]:
-    """Return a message as a rosbridge server's object, with its losses: NaN and the infinities become
-    null, and invalid UTF-8 in a text is replaced.
-    """
-    at = 0
-
-    def one(kind: str) -> Any:
-        nonlocal at
-        start = at
-        if kind in SIZES:
-            at += SIZES[kind]
-            values = struct.unpack(f"<{_LETTERS[kind]}", data[start:at])
-            if len(values) == 2:
-                return {"secs": values[0], "nsecs": values[1]}
-            return None if kind.startswith("float") and not math.isfinite(values[0]) else values[0]
-        if kind == STRING:
-            (length,) = struct.unpack_from("<I", data, at)
-            at += 4 + length
-            return data[start + 4 : at].decode("utf-8", "replace")
-        return {field.name: several(field) for field in message.types[kind]}
-
-    def several(field: Field) -> Any:
-        nonlocal at
-        if field.length is None:
-            return one(field.kind)
-        count = field.length
-        if count == VARIABLE:
-            (count,) = struct.unpack_from("<I", data, at)
-            at += 4
-        if field.kind in {"uint8", "char"}:
-            at += count
-            return base64.b64encode(data[at - count : at]).decode()
-        return [one(field.kind) for _ in range(count)]
-
-    found: dict[str, Any] = one(message.kind)
     return found
 
 

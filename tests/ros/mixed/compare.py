@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,32 +83,29 @@ class Difference(NamedTuple):
         return f"{self.topic}: {counted}; {self.first}"
 
 
-def compare(
-    recorded: Bag, exported: Bag, *, same: Callable[[str, bytes], object] = lambda _topic, data: data
-) -> list[Difference]:
-    """Return the topics that differ, as multisets; ``same`` maps a topic's message to its identity."""
+def compare(recorded: Bag, exported: Bag) -> list[Difference]:
+    """Return the topics that differ, as multisets."""
     found = []
     for topic, kind in recorded.kinds.items():
         sent, came = recorded.of(topic), exported.of(topic)
-        left = Counter(same(topic, one.data) for one in came)
-        missing = []
-        for one in sent:
-            key = same(topic, one.data)
-            if left[key]:
-                left[key] -= 1
-            else:
-                missing.append(one)
-        extra = []
-        for one in reversed(came):
-            key = same(topic, one.data)
-            if left[key]:
-                left[key] -= 1
-                extra.insert(0, one)
+        missing = _beyond(sent, Counter(one.data for one in came))
+        extra = _beyond(came[::-1], Counter(one.data for one in sent))[::-1]
         if missing or extra:
             found.append(Difference(topic, len(sent), missing, extra, _words(kind, missing, extra)))
         elif came and kind[:2] != exported.kinds[topic][:2]:
             found.append(Difference(topic, len(sent), [], [], f"{exported.kinds[topic][:2]}, not {kind[:2]}"))
     return found
+
+
+def _beyond(messages: list[Recorded], known: Counter[bytes]) -> list[Recorded]:
+    """Return the messages beyond the known ones."""
+    beyond = []
+    for message in messages:
+        if known[message.data]:
+            known[message.data] -= 1
+        else:
+            beyond.append(message)
+    return beyond
 
 
 def _words(kind: Kind, missing: list[Recorded], extra: list[Recorded]) -> str:

@@ -8,16 +8,14 @@ mistake. IORT_MIXED_S sets the duration, see `make prove-mixed`.
 from __future__ import annotations
 
 import base64
-import contextlib
 import itertools
 import json
 import os
 import shutil
-import sys
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,13 +27,11 @@ from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.network.proxy import PASS, REFUSE, Proxy
-from testkit.ros1_types import as_json
 from testkit.waiting import until
 from tests.local.conftest import embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed.compare import Bag, Difference, Recorded, compare, read
 from tests.ros.mixed.robot import NODES, TOPICS
-from tests.ros.mixed.rosbridge import GraphServer
 
 pytestmark = pytest.mark.heavy
 
@@ -72,16 +68,13 @@ class Drive:
     second: list[tuple[int, str]]
     # The number of agents so far; each receives the latched messages.
     agents: int
-    same: Callable[[str, bytes], object]
 
 
 class Mixed:
     """The graph with its publishers and its recorder, and the agents beside it."""
 
-    def __init__(
-        self, graph: Graph, cloud: EmbeddedCloud, proxy: Proxy, out: Path, server: GraphServer | None
-    ) -> None:
-        self.graph, self.proxy, self.out, self.server = graph, proxy, out, server
+    def __init__(self, graph: Graph, cloud: EmbeddedCloud, proxy: Proxy, out: Path) -> None:
+        self.graph, self.proxy, self.out = graph, proxy, out
         topics = {
             name: {"stream": topic.stream, "time": "header" if topic.message.stamped else "arrival"}
             for name, topic in TOPICS.items()
@@ -89,11 +82,7 @@ class Mixed:
         settings = {
             "port": proxy.port,
             "queue": {"path": "spool.db"},
-            "sources": [
-                {"type": "ros1", "topics": topics}
-                if server is None
-                else {"type": "rosbridge", "url": server.url, "topics": topics}
-            ],
+            "sources": [{"type": "ros1", "topics": topics}],
         }
         self.bundle = robots.add(cloud.cloud, out.name, out=out, settings=settings)
         self.agents = 0
@@ -102,14 +91,7 @@ class Mixed:
         """Start an agent of the robot, from its own folder or a copy of it."""
         config = (folder or self.bundle.folder) / self.bundle.config.name
         self.agents += 1
-        # A robot with rosbridge needs no ROS, and has its own Python.
-        python = self.graph.python if self.server is None else sys.executable
-        command = ["-m", "iort_agent.cli", "run", "--config", str(config), "--drain-s", "60"]
-        return self.graph.start([python, *command])
-
-    def same(self, topic: str, data: bytes) -> object:
-        """Return a message's identity: all of it, or as much as rosbridge can transmit."""
-        return data if self.server is None else json.dumps(as_json(TOPICS[topic].message, data))
+        return self.graph.module("iort_agent.cli", "run", "--config", config, "--drain-s", 60)
 
     def copy(self) -> Path:
         """Copy the folder for another computer: with the certificate, without the queue."""
@@ -146,23 +128,20 @@ def _connections(publishers: dict[str, Process]) -> Iterator[tuple[Publisher, in
                 yield (said["topic"], node), said["n"], said["connections"]
 
 
-@pytest.fixture(scope="module", params=["ros1", "rosbridge"])
+@pytest.fixture(scope="module")
 def drive(
-    request: pytest.FixtureRequest,
     embedded: EmbeddedCloud,  # noqa: F811 - the fixture
     ros_python: str,  # noqa: F811 - the fixture
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Drive]:
     if not RECORD.is_file():
         pytest.skip("ROS 1's recorder is not installed: apt install rosbag")
-    folder = tmp_path_factory.mktemp(f"mixed-{request.param}-")
+    folder = tmp_path_factory.mktemp("mixed")
     graph = Graph(ros_python, folder)
     try:
         graph.start_master()
-        with contextlib.ExitStack() as stack:
-            proxy = stack.enter_context(Proxy("127.0.0.1", embedded.cloud.mqtt_port))
-            server = stack.enter_context(GraphServer(graph)) if request.param == "rosbridge" else None
-            yield _driven(Mixed(graph, embedded, proxy, folder, server), embedded)
+        with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy:
+            yield _driven(Mixed(graph, embedded, proxy, folder), embedded)
     finally:
         graph.stop()
 
@@ -188,8 +167,6 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     for publisher in publishers.values():
         publisher.until(lambda publisher=publisher: "ready" in publisher.lines, "connections")
     agent.until_said("connected to 127.0.0.1")
-    if mixed.server is not None:
-        mixed.server.wait_for("subscribe", len(TOPICS))
     for publisher in publishers.values():
         publisher.say("begin")
     began = time.monotonic()
@@ -202,8 +179,8 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     pause.wait(OUTAGE_S)
     mixed.proxy.mode = PASS
     at(0.45)
-    # The same command again, and the robot's folder elsewhere: rosbridge has no node names to detect it.
-    others = [mixed.agent(), *([mixed.agent(mixed.copy())] if mixed.server is None else [])]
+    # The same command again, and the robot's folder elsewhere.
+    others = [mixed.agent(), mixed.agent(mixed.copy())]
     second = [(others[0].ended(), "\n".join(others[0].errors))]
     for other in others[1:]:
         other.until_said("another node is called")
@@ -226,8 +203,7 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
             topic, content = line.split(" ")
             sent[topic, node].append(base64.b64decode(content))
     until(mixed.settled, within_s=300)
-    server = mixed.server
-    unheard = _unheard(publishers, before, sent) if server is None else server.unheard
+    unheard = _unheard(publishers, before, sent)
     for publisher in publishers.values():
         publisher.say("quit")
     assert agent.terminate() in {0, 1}, "\n".join(agent.errors[-25:])
@@ -238,7 +214,7 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     assert audited.exit_code in {0, 1}, audited.output
     return Drive(
         read(bag), exported, sent, failed, unheard, killed_ns, audited.exit_code,
-        json.loads(audited.stdout), second, mixed.agents, mixed.same,
+        json.loads(audited.stdout), second, mixed.agents,
     )  # fmt: skip
 
 
@@ -289,29 +265,25 @@ def differences(drive: Drive) -> list[Difference]:
     repeated latched messages: each agent receives them.
     """
 
-    def counted(topic: str, messages: Iterable[bytes]) -> Counter[object]:
-        return Counter(drive.same(topic, data) for data in messages)
-
-    unheard = {topic: counted(topic, drive.unheard.get(topic, ())) for topic in TOPICS}
-    lost: dict[str, Counter[object]] = {topic: Counter() for topic in TOPICS}
+    unheard = {topic: Counter(drive.unheard.get(topic, ())) for topic in TOPICS}
+    lost: dict[str, Counter[bytes]] = {topic: Counter() for topic in TOPICS}
     for (topic, node), messages in drive.sent.items():
         recorded = [one.data for one in drive.recorded.of(topic) if one.node == node]
-        lost[topic] += counted(topic, messages) - counted(topic, recorded)
+        lost[topic] += Counter(messages) - Counter(recorded)
         if TOPICS[topic].latched:
-            lost[topic] += counted(topic, messages * (drive.agents - 1))
+            lost[topic] += Counter(messages * (drive.agents - 1))
 
-    def less(messages: list[Recorded], excused: dict[str, Counter[object]]) -> list[Recorded]:
+    def less(messages: list[Recorded], excused: dict[str, Counter[bytes]]) -> list[Recorded]:
         found = []
         for one in messages:
-            told = drive.same(one.topic, one.data)
-            if not excused[one.topic][told]:
+            if not excused[one.topic][one.data]:
                 found.append(one)
             else:
-                excused[one.topic][told] -= 1
+                excused[one.topic][one.data] -= 1
         return found
 
     found = []
-    for one in compare(drive.recorded, drive.exported, same=drive.same):
+    for one in compare(drive.recorded, drive.exported):
         missing, extra = less(one.missing, unheard), less(one.extra, lost)
         if missing or extra or (not one.missing and not one.extra):
             found.append(one._replace(missing=missing, extra=extra))
@@ -320,12 +292,11 @@ def differences(drive: Drive) -> list[Difference]:
 
 def lost_at_the_kill(drive: Drive) -> tuple[float, float]:
     """Return the time around the kill, in ns, whose messages may be missing: that of the open batches, and of
-    every publisher's messages that are missing without a break until then, or from then on. Those without an
-    agent count: a server that lags has the messages from before the kill after it.
+    every publisher's messages that are missing without a break until then, or from then on.
     """
     killed, lag = drive.killed_ns, LAG_S * 1e9
     since, until_ns = killed - OPEN_S * 1e9, killed + 1e9
-    for one in compare(drive.recorded, drive.exported, same=drive.same):
+    for one in compare(drive.recorded, drive.exported):
         for node in {m.node for m in one.missing}:
             missing = {m.t_ns for m in one.missing if m.node == node}
             times = [m.t_ns for m in drive.recorded.of(one.topic) if m.node == node]
@@ -341,8 +312,7 @@ def to_be_named(drive: Drive, one: Difference, lost: tuple[float, float]) -> int
     messages only the number in transit at that time is known.
     """
     then = [m for m in drive.recorded.of(one.topic) if lost[0] <= m.t_ns <= lost[1]]
-    there = Counter(drive.same(one.topic, m.data) for m in then)
-    left = Counter(drive.same(one.topic, m.data) for m in one.missing) - there
+    left = Counter(m.data for m in one.missing) - Counter(m.data for m in then)
     return len(one.extra) + sum(left.values())
 
 
