@@ -3,7 +3,6 @@ ROS."""
 
 from __future__ import annotations
 
-import os
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,12 +62,6 @@ class BagConfig(SourceConfig):
 
     def check(self, title: str) -> Iterator[Finding]:
         """Whether the recording can be opened, has every topic, and has a first message."""
-        if not self.path.exists():
-            yield Finding(title, FAIL, f"{self.path} is not there")
-            return
-        if not os.access(self.path, os.R_OK):
-            yield Finding(title, FAIL, f"{self.path} may not be read", f"chmod a+r {self.path}")
-            return
         source = self.build(SystemClock())
         try:
             with source.open() as messages:

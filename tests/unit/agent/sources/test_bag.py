@@ -300,17 +300,6 @@ def test_a_recording_without_a_vesc_needs_topics(tmp_path: Path) -> None:
         play(tmp_path / "a.bag")
 
 
-@pytest.mark.parametrize("name", ["a.bag", "drive"])
-def test_what_is_no_recording(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    if name == "drive":
-        path.mkdir()
-    else:
-        path.write_bytes(b"not a bag")
-    with pytest.raises(SourceError, match=name):
-        play(path)
-
-
 def test_a_recording_cut_short_says_so(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "a.bag")
     path.write_bytes(path.read_bytes()[:-200])

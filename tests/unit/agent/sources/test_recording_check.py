@@ -44,28 +44,9 @@ def test_a_log_that_can_be_played(tmp_path: Path) -> None:
     assert found(tmp_path, path, "stamps: original").level == OK
 
 
-def test_a_topic_that_is_not_there(tmp_path: Path) -> None:
-    finding = found(tmp_path, write_ros1(tmp_path / "a.bag"), "topics: {/odom: odom}")
-    assert finding.level == FAIL
-    assert "no topic /odom; the recording has /sensors/core (" in finding.text
-
-
 def test_a_topic_without_a_message(tmp_path: Path) -> None:
     finding = found(tmp_path, write_ros1(tmp_path / "a.bag", count=0))
     assert (finding.level, finding.text) == (FAIL, "it has no message of vesc")
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ("stamps: original", "`stamps: original` needs the day"),
-        ("topics: {/core: vesc}", "has no topics; `stream` names its stream"),
-    ],
-)
-def test_settings_that_do_not_fit_a_log(tmp_path: Path, settings: str, words: str) -> None:
-    finding = found(tmp_path, write(tmp_path, row(1000)), settings)
-    assert finding.level == FAIL
-    assert words in finding.text
 
 
 def test_a_log_with_more_columns_than_a_sample_may_have(tmp_path: Path) -> None:
