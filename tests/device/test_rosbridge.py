@@ -287,12 +287,12 @@ def test_a_deaf_server_is_resubscribed_after_a_master_restart(server: RosbridgeS
         server.publish(CORE, state(12, seq=12))
         running.wait_for(2)
     report = running.source.report()[CORE]
-    assert (report["missed"], report["interruptions"], report["resubscribed"]) == (10, 1, 1)
+    assert (report["interruptions"], report["resubscribed"]) == (1, 1)
     assert report["dark_s"] >= 0.5
 
 
 @pytest.mark.parametrize("how", ["closed", "cut"])
-def test_messages_lost_in_an_interruption_are_counted(server: RosbridgeStandin, how: str) -> None:
+def test_an_interruption_is_counted_for_every_topic(server: RosbridgeStandin, how: str) -> None:
     with Running(config(server, "/stamped", "/plain")) as running:
         server.wait_for("subscribe", 2)
         server.publish("/stamped", numbered(41))
@@ -308,10 +308,7 @@ def test_messages_lost_in_an_interruption_are_counted(server: RosbridgeStandin, 
         server.publish("/stamped", numbered(62))
         server.publish("/plain", {"n": 62})
         running.wait_for(4)
-    stamped, plain = (running.source.report()[name] for name in ("/stamped", "/plain"))
-    assert stamped["missed"] == 20
-    assert "missed" not in plain
-    for report in (stamped, plain):
+    for report in (running.source.report()[name] for name in ("/stamped", "/plain")):
         assert report["interruptions"] == 1
         assert report["dark_s"] > 0
 

@@ -67,7 +67,6 @@ LOST = frozenset(
         "malformed",
         "refused",
         "empty",
-        "missed",
         "interruptions",
         "dropped_samples",
         "damaged_files",

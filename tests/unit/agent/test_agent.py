@@ -6,7 +6,7 @@ import json
 import threading
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Callable
+from typing import Any, Callable, Sequence
 from unittest.mock import Mock
 
 import pytest
@@ -51,11 +51,11 @@ DOWNLINK = {
 class Script(SourceConfig):
     """A source that runs a function."""
 
-    def __init__(self, run: Any) -> None:
-        self.run = run
+    def __init__(self, run: Any, *streams: str) -> None:
+        self.run, self._streams = run, streams or ("vesc",)
 
-    def streams(self) -> list[str]:
-        return ["vesc"]
+    def streams(self) -> Sequence[str]:
+        return self._streams
 
     def describe(self) -> str:
         return "script"

@@ -18,7 +18,6 @@ from iort_agent.config import Config
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.runtime import Runtime
-from iort_agent.sources import Emit, SourceConfig
 from iort_agent.spool import REJECT_NEW
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM
@@ -26,6 +25,7 @@ from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.live import decode_live
 from iort_contract.topics import LIVE, RECORD, build_topic
 from testkit.agent import Loopback, ManualClock
+from tests.unit.agent.test_agent import Script
 
 T0_S = 1_700_000_000.0
 HOSTILE = "refused\n<3>forged\r\x1b]52;c;cm0=\x07 \x9b2J \u202e\u2028\udc80 Straße"
@@ -143,21 +143,8 @@ def test_a_line_that_is_sent_is_the_agents_own_short_and_has_no_secrets(
     assert [line["text"] for _, line in said(text, **more).lines.take()] == sent
 
 
-class Failing(SourceConfig):
-    def streams(self) -> list[str]:
-        return ["vesc"]
-
-    def describe(self) -> str:
-        return "failing"
-
-    def build(self, _clock: object) -> Failing:
-        return self
-
-    def report(self) -> dict[str, Any]:
-        return {}
-
-    def run(self, _emit: Emit, _stop: object) -> None:
-        raise SourceError("the device is gone")
+def fail(*_: object) -> None:
+    raise SourceError("the device is gone")
 
 
 @contextmanager
@@ -165,7 +152,7 @@ def logging_agent(uplink: Loopback, clock: ManualClock) -> Iterator[Agent]:
     """An agent whose only source fails, and which sends what is logged."""
     troubles = Troubles()
     spool = MemorySpool(max_bytes=2000, policy=REJECT_NEW)
-    config = Config("car1", "host", Path(), Path(), (Failing(),))
+    config = Config("car1", "host", Path(), Path(), (Script(fail),))
     logging.getLogger().addHandler(troubles)
     try:
         yield Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
@@ -201,7 +188,7 @@ def test_the_last_line_of_a_run_is_recorded() -> None:
     uplink = Loopback(clock, Dispatcher())
     with logging_agent(uplink, clock) as agent:
         assert Runtime(agent).run(drain_s=10) == 1
-    assert recorded(uplink) == ["source failed: failing: the device is gone"]
+    assert recorded(uplink) == ["source failed: script: the device is gone"]
 
 
 def test_a_failing_link_adds_few_lines() -> None:

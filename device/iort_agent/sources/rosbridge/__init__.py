@@ -26,9 +26,6 @@ from iort_contract.limits import MessageError
 _AGAIN_S = 10.0
 # A topic has few latching publishers; each holds one message.
 _RECENT = 16
-_MAX_PUBLISHERS = 8
-# A number so far ahead comes from another publisher, not from the same one after a loss.
-_MAX_GAP = 100_000
 
 
 class Repeats:
@@ -62,41 +59,6 @@ class Repeats:
             self._repeats_itself = True
         self._recent.append(digest)
         return False
-
-
-class Numbers:
-    """Counts missing messages by ``header.seq``, which each ROS 1 publisher counts up.
-
-    The server does not name a message's publisher, so the publishers of a topic are told apart by their
-    numbers. A gap is no longer counted when another publisher turns out to continue from its beginning.
-    """
-
-    def __init__(self) -> None:
-        self.missed = 0
-        # The last number of each publisher, the most recent at the end.
-        self._last: list[int] = []
-        # The number before a gap -> how many are missing.
-        self._gaps: dict[int, int] = {}
-
-    def take(self, seq: int) -> None:
-        """Take a message's number."""
-        last = self._last
-        if seq in last:
-            return
-        if seq - 1 in last:
-            last.remove(seq - 1)
-        elif seq - 1 in self._gaps:
-            self.missed -= self._gaps.pop(seq - 1)
-        else:
-            before = max((one for one in last if seq - _MAX_GAP < one < seq), default=None)
-            if before is not None:
-                last.remove(before)
-                if len(self._gaps) >= _MAX_PUBLISHERS:
-                    del self._gaps[next(iter(self._gaps))]
-                self._gaps[before] = seq - before - 1
-                self.missed += seq - before - 1
-        last.append(seq)
-        del last[:-_MAX_PUBLISHERS]
 
 
 # Messages of a topic that are held until its type is known.
@@ -174,7 +136,7 @@ class RosbridgeSource:
         """Subscribe until ``stop`` is set. Raises `SourceError` without websocket-client."""
         for name, topic in self._config.topics:
             taken = Intake(name, topic, emit=emit, clock=self._clock)
-            self._hearings[name] = _Hearing(topic, taken, self._clock)
+            self._hearings[name] = _Hearing(taken, self._clock)
         self.connection.run(stop)
 
     def report(self) -> dict[str, Any]:
@@ -219,12 +181,10 @@ class RosbridgeSource:
 class _Hearing:
     """One topic's messages, from JSON to the bytes that its intake takes."""
 
-    def __init__(self, config: TopicConfig, taken: Intake, clock: Clock) -> None:
+    def __init__(self, taken: Intake, clock: Clock) -> None:
         self.repeats = Repeats()
-        self._config = config
         self._intake = taken
         self._clock = clock
-        self._numbers = Numbers()
         self._messages = 0
         # The messages that wait for the structure, with the sizes of their texts.
         self._held: deque[tuple[dict[str, Any], int, int]] = deque()
@@ -251,9 +211,6 @@ class _Hearing:
         if not isinstance(message, dict):
             self._intake.warn("malformed", f"a message must be an object, got {message!r:.60}")
             return True
-        seq = header.get("seq")
-        if type(seq) is int and not self._config.throttle_ms:
-            self._numbers.take(seq)
         if self._writer is not None:
             self._record(self._writer, message, arrival_us)
             return True
@@ -283,8 +240,6 @@ class _Hearing:
 
     def report(self) -> dict[str, Any]:
         counts = {name: count for name, count in self._intake.report().items() if count}
-        if self._numbers.missed:
-            counts["missed"] = self._numbers.missed
         if self._held:
             counts["type_unknown"] = counts.get("type_unknown", 0) + len(self._held)
         return {**counts, "messages": self._messages}

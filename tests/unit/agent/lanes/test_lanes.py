@@ -14,20 +14,20 @@ from typing import Any, NamedTuple
 import pytest
 
 from iort_agent.agent import Agent, make_status
-from iort_agent.common.threads import Clock, SystemClock
+from iort_agent.common.threads import SystemClock
 from iort_agent.config import Config
 from iort_agent.lanes import LiveConfig, PingConfig, RecordConfig
 from iort_agent.lanes.record import Production, Rate, too_many
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import URGENT, RateLimiter
 from iort_agent.runtime import Runtime
-from iort_agent.sources import SourceConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status import render
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.shadow import ALWAYS
 from iort_contract.topics import BROKER, LIVE
 from testkit.agent import Loopback, ManualClock, Published
+from tests.unit.agent.test_agent import Script
 
 T0 = 1_700_000_000_000_000
 TICK_MS = 200
@@ -46,26 +46,9 @@ class Topic(NamedTuple):
     values: Callable[[], Mapping[str, Any]]
 
 
-class Named(SourceConfig):
+def named(count: int) -> Script:
     """A source that only names its streams."""
-
-    def __init__(self, count: int) -> None:
-        self._names = [f"topic{i:03}" for i in range(count)]
-
-    def streams(self) -> list[str]:
-        return self._names
-
-    def describe(self) -> str:
-        return "named"
-
-    def build(self, clock: Clock) -> Named:
-        return self
-
-    def run(self, emit: object, stop: object) -> None:
-        """End at once."""
-
-    def report(self) -> dict[str, Any]:
-        return {}
+    return Script(lambda *_: None, *(f"topic{i:03}" for i in range(count)))
 
 
 class Drive:
@@ -396,7 +379,7 @@ def test_too_many_streams_are_recognized_from_the_configuration(
     streams: int, batch_s: float, made: int | None
 ) -> None:
     record = RecordConfig(batch_s=batch_s)
-    config = Config("car1", "host", Path(), Path(), (Named(streams),), record=record)
+    config = Config("car1", "host", Path(), Path(), (named(streams),), record=record)
     problem = too_many(config.sources, config.record)
     assert (problem is None) == (made is None)
     assert made is None or f"up to {made} batches a second, and one connection takes 90" in str(problem)
@@ -406,7 +389,7 @@ def test_too_many_streams_are_recognized_from_the_configuration(
 def test_too_many_streams_are_logged_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
     clock = SystemClock()
     agent = Agent(
-        Config("car1", "host", Path(), Path(), (Named(91),)),
+        Config("car1", "host", Path(), Path(), (named(91),)),
         uplink=Loopback(clock, Dispatcher()),
         spool=MemorySpool(max_bytes=10**6),
         clock=clock,

@@ -1,4 +1,4 @@
-"""What rosapi says of a type, and messages that came again or not at all."""
+"""What rosapi says of a type, and messages that came again."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from iort_agent.sources.rosbridge import Numbers, Repeats
+from iort_agent.sources.rosbridge import Repeats
 from iort_agent.sources.rosbridge.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition, md5sum, parse
@@ -247,57 +246,6 @@ def test_what_another_server_said_is_forgotten() -> None:
     rig.rosapi.ask("/a", None)
     rig.answer(LISTED)
     assert rig.found == [("/a", from_text("a_msgs/A", "bool a"))]
-
-
-# What came again, and what did not come.
-
-
-@pytest.mark.parametrize(
-    ("numbers", "missed"),
-    [
-        ([7, 8, 9], 0),
-        ([7, 9, 12], 3),
-        ([0, 0, 0], 0),
-        ([100, 101, 1, 2, 3], 0),
-        ([100, 101, 1, 2, 5], 2),
-        ([100, 1, 101, 2, 102], 0),
-        ([100, 5000, 101, 5001], 0),
-        ([100, 5000, 101, 5001, 111, 5011], 18),
-        ([3, 4_000_000, 4_000_001], 0),
-    ],
-    ids=[
-        "in order", "gaps", "not counted up", "started again", "a gap after that", "two publishers",
-        "the second is far ahead", "both missed some", "too far to be a gap",
-    ],
-)  # fmt: skip
-def test_what_is_missing(numbers: list[int], missed: int) -> None:
-    counted = Numbers()
-    for number in numbers:
-        counted.take(number)
-    assert counted.missed == missed
-
-
-@given(
-    st.lists(st.booleans(), min_size=1, max_size=200),
-    st.integers(0, 50),
-    st.integers(1_000, 2_000),
-    st.integers(1, 40),
-)
-def test_two_publishers_that_lose_the_same_stretch(order: list[bool], a: int, b: int, lost: int) -> None:
-    """However their messages are mixed, what is missing is known once both have spoken before and after."""
-    following, counted = {True: a, False: b}, Numbers()
-    for publisher in [True, False, *order]:
-        counted.take(following[publisher])
-        following[publisher] += 1
-    assert counted.missed == 0 or not {True, False} <= set(order)
-    counted.take(following[True])
-    counted.take(following[False])
-    for publisher in (True, False):
-        following[publisher] += 1 + lost
-    for publisher in [True, False, *order]:
-        counted.take(following[publisher])
-        following[publisher] += 1
-    assert counted.missed == 2 * lost
 
 
 MAP = b'{"op": "publish", "topic": "/map", "msg": {"data": "a map"}}'
