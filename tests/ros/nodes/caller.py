@@ -13,13 +13,9 @@ import rospy
 from genpy.dynamic import generate_dynamic
 from std_msgs.msg import String
 
+from tests.ros.nodes import say
+
 PARTS = {"Request": "", "Response": "bool success\nstring message"}
-
-
-def say(line: str) -> None:
-    """Write a line at once; print writes the newline separately, so two threads' lines would mix."""
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
 
 
 def trigger():

@@ -18,13 +18,7 @@ from iort_agent.common.schema import Place, load
 from iort_agent.common.threads import SystemClock
 from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.ros1.message import RosMessage
-
-
-def say(line: str) -> None:
-    """Write a line at once; print writes the newline separately, so two threads' lines would mix."""
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
-
+from tests.ros.nodes import say
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
 file = Path(sys.argv[1])

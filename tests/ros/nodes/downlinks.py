@@ -30,13 +30,7 @@ from iort_agent.ros1.node import DEFAULT_NODE, shared
 from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
 from iort_contract.messages.questions import Answer, Refusal, decode_ask, encode_answer
 from testkit.agent import Loopback, Published, link_of
-
-
-def say(line: str) -> None:
-    """Write a line at once; print writes the newline separately, so two threads' lines would mix."""
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
-
+from tests.ros.nodes import say
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
 file = Path(sys.argv[1])

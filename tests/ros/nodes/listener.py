@@ -9,12 +9,7 @@ import roslib.message
 import rospy
 
 from iort_agent.ros1 import master
-
-
-def say(line: str) -> None:
-    """Write a line at once; print writes the newline separately, so two threads' lines would mix."""
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
+from tests.ros.nodes import say
 
 
 def plain(value):
