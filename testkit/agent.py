@@ -1,4 +1,4 @@
-"""Fakes of the agent's seams: a clock that stands still, and a broker in memory."""
+"""Fakes of the agent's seams: a clock that stands still, a broker and a spool in memory."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from iort_agent.errors import UplinkError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Done, Link, MqttMessage, OnConnection, OnMessage, Uplink, matches
+from iort_agent.spool import OVERWRITE_OLDEST, OnStored
+from iort_agent.spool.memory import Memory
+from iort_contract.messages.batch import RunEnd
 
 
 class ManualClock:
@@ -174,3 +177,40 @@ class Loopback:
 def link_of(uplink: Uplink, clock: Clock, *, robot: str = "car1") -> Link:
     """Return the link of a robot in the default namespace, with the limits of AWS."""
     return Link(robot, "iort", uplink, clock, RateLimiter(clock))
+
+
+class MemorySpool:
+    """A spool that ends with its test."""
+
+    alarm: str | None = None
+    damaged = 0
+    durable = False
+
+    def __init__(self, *, max_bytes: int, policy: str = OVERWRITE_OLDEST) -> None:
+        self._memory = Memory(max_bytes=max_bytes, policy=policy)
+        self._handlers: list[OnStored] = []
+        self._arrived: set[str] = set()
+        self.next, self.backlog, self.dropped = self._memory.next, self._memory.backlog, self._memory.dropped
+
+    def on_stored(self, handler: OnStored) -> None:
+        """Call the handler after every put."""
+        self._handlers.append(handler)
+
+    def previous(self, stream: str) -> tuple[RunEnd, ...] | None:
+        """No runs: they are not known."""
+        return None if stream in self._arrived else ()
+
+    def put(self, stream: str, boot: str, seq: int, payload: bytes, *, samples: int) -> None:  # noqa: ARG002 - it knows no runs
+        """Keep a batch."""
+        self._memory.put(stream, seq, payload, samples=samples)
+        for handler in self._handlers:
+            handler()
+
+    def ack(self, entry_id: int) -> None:
+        """Forget a batch."""
+        entry = self._memory.take(entry_id)
+        if entry is not None:
+            self._arrived.add(entry.stream)
+
+    def close(self) -> None:
+        """Nothing to do."""

@@ -72,7 +72,7 @@ def load_config(file: Path) -> Config:
     if content is None:
         raise ConfigError(f"{file}: is empty")
     config = load(Config, content, place)
-    if (content.get("queue") or {}).get("path") is None:
+    if config.queue.path is None:
         config = replace(config, queue=replace(config.queue, path=default_path(file, config.robot)))
     try:
         config.downlink.check_topics()

@@ -195,7 +195,7 @@ class Runtime:
         left = spool.backlog()
         rest = f"{left.samples} samples in {left.batches} batches were not delivered"
         if not spool.durable:
-            _log.error("%s and are lost: the queue is in memory, see queue.path", rest)
+            _log.error("%s and are lost: the queue's disk does not work", rest)
         elif stopped:
             _log.warning("%s; the next run sends them, or `iort-agent flush`", rest)
         else:

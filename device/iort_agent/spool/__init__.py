@@ -1,4 +1,4 @@
-"""Where batches wait until the broker has acknowledged them, in memory or on disk."""
+"""Where batches wait until the broker has acknowledged them."""
 
 from __future__ import annotations
 
@@ -86,10 +86,6 @@ class Spool(Protocol):
         """End in good order. The next run finds what is kept, if the spool is durable."""
 
 
-# The value of ``path`` for a queue that ends with the agent.
-MEMORY = "memory"
-
-
 def default_path(file: Path, robot: str) -> Path:
     """The queue's file if the configuration names none: beside it, or, if that folder may not be written, in
     the service's or the user's folder of state. Each robot has its own."""
@@ -104,8 +100,8 @@ def default_path(file: Path, robot: str) -> Path:
 
 def _queue_file(value: Any, where: Place) -> Path | None:
     """The path of a file that may be made: in a folder that exists, and not the configuration's own."""
-    allowed = f"the path of a file, in a folder that exists, or {MEMORY}"
-    if value is None or value == MEMORY:
+    allowed = "the path of a file, in a folder that exists"
+    if value is None:
         return None
     if not isinstance(value, str) or not value:
         raise where.error(value, allowed)
@@ -122,7 +118,7 @@ class QueueConfig:
     """Where batches wait for the broker, and what to drop when it is full (Greengrass' words).
 
     ``path``: the queue's file, which need not exist. Without it, it is ``<robot>.queue.db`` beside the
-    configuration. ``memory``: the queue ends with the agent, and so does what waits in it.
+    configuration.
     ``max_bytes`` bounds the batches in it, and the file is a little larger. ``durability``: what the
     file survives, the end of the process or a power cut (``full``) too.
     """

@@ -1,47 +1,31 @@
-"""A spool in memory, which ends with the process."""
+"""The batches that a spool has in memory, in order, and within a bound."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
 
-from iort_agent.spool import OVERWRITE_OLDEST, Backlog, Dropped, Entry, OnStored
-from iort_contract.messages.batch import RunEnd
+from iort_agent.spool import OVERWRITE_OLDEST, Backlog, Dropped, Entry
 
 
-class MemorySpool:
-    """A spool that ends with the process. ``max_bytes`` bounds the ``payload_bytes``; ``last_id`` is the
-    id of the last batch that was put."""
-
-    alarm: str | None = None
-    damaged = 0
-    durable = False
+class Memory:
+    """Batches by their ids. ``max_bytes`` bounds the ``payload_bytes``; ``last_id`` is the id of the last
+    batch."""
 
     def __init__(self, *, max_bytes: int, policy: str = OVERWRITE_OLDEST) -> None:
         self.max_bytes = max_bytes
         self.last_id = 0
         self._overwrite = policy == OVERWRITE_OLDEST
         self._lock = threading.Lock()
-        self._handlers: list[OnStored] = []
         self._entries: OrderedDict[int, Entry] = OrderedDict()
         self.payload_bytes = self._samples = 0
         self._dropped = Dropped(0, 0)
-        self._arrived: set[str] = set()
 
     def __len__(self) -> int:
         """How many batches are kept."""
         return len(self._entries)
 
-    def on_stored(self, handler: OnStored) -> None:
-        """Call the handler after every put."""
-        self._handlers.append(handler)
-
-    def previous(self, stream: str) -> tuple[RunEnd, ...] | None:
-        """No runs: they are not known."""
-        with self._lock:
-            return None if stream in self._arrived else ()
-
-    def put(self, stream: str, boot: str, seq: int, payload: bytes, *, samples: int) -> None:  # noqa: ARG002 - it knows no runs
+    def put(self, stream: str, seq: int, payload: bytes, *, samples: int) -> None:
         """Keep a batch; drops it or the oldest ones when there is no room."""
         with self._lock:
             self.last_id += 1
@@ -55,8 +39,6 @@ class MemorySpool:
             self._entries[entry.id] = entry
             self.payload_bytes += size
             self._samples += samples
-        for handler in self._handlers:
-            handler()
 
     def next(self, after: int) -> Entry | None:
         """The oldest batch after that one."""
@@ -81,13 +63,6 @@ class MemorySpool:
         with self._lock:
             return self._remove(entry_id) if entry_id in self._entries else None
 
-    def ack(self, entry_id: int) -> None:
-        """Forget a batch."""
-        entry = self.take(entry_id)
-        if entry is not None:
-            with self._lock:
-                self._arrived.add(entry.stream)
-
     def backlog(self) -> Backlog:
         """What is kept now."""
         with self._lock:
@@ -97,9 +72,6 @@ class MemorySpool:
         """What was dropped since the start."""
         with self._lock:
             return self._dropped
-
-    def close(self) -> None:
-        """Nothing to do."""
 
     def _remove(self, entry_id: int) -> Entry:
         entry = self._entries.pop(entry_id)

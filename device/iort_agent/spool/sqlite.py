@@ -1,6 +1,6 @@
 """The spool on disk: its batches survive the process and, if so configured, a power cut.
 
-A batch is put into a `MemorySpool`. One thread, the only one that touches the disk, moves what waits there
+A batch is put into `Memory`. One thread, the only one that touches the disk, moves what waits there
 into an SQLite file in one transaction: at once, but not within `GROUP_S` of the one before. `next` gives a
 batch after that transaction, never before. So a published batch survives a kill and, with ``durability:
 full``, a power cut. A kill costs the puts of the last `GROUP_S`.
@@ -9,7 +9,7 @@ Acknowledgements are written with the next batch, or `ACKS_S` later: to wake the
 than to write them. A crash may lose these, and then batches are sent again, with the same number and content.
 
 A disk that is full, read-only or failing does not stop the agent: the spool is degraded. Batches stay where
-they are, in the memory spool, up to `MEMORY_BYTES`, and are published from there, after what can be read of
+they are, in memory, up to `MEMORY_BYTES`, and are published from there, after what can be read of
 the file. The alarm says so, and writing is tried again every `RETRY_S`. A damaged file is set aside, and what
 is still good in it goes into a new one.
 """
@@ -27,7 +27,7 @@ from typing import Callable, Iterable
 
 from iort_agent.common.threads import Clock, Supervised
 from iort_agent.errors import AgentError
-from iort_agent.spool import OVERWRITE_OLDEST, PROCESS, Backlog, Dropped, Entry, OnStored, QueueConfig, Spool
+from iort_agent.spool import OVERWRITE_OLDEST, PROCESS, Backlog, Dropped, Entry, OnStored, QueueConfig
 from iort_agent.spool.file import (
     READ_BYTES,
     READ_ENTRIES,
@@ -38,7 +38,7 @@ from iort_agent.spool.file import (
     rebuild,
     rebuilt,
 )
-from iort_agent.spool.memory import MemorySpool
+from iort_agent.spool.memory import Memory
 from iort_contract.messages.batch import RunEnd
 
 _log = logging.getLogger(__name__)
@@ -55,13 +55,12 @@ _TRIM_ENTRIES = 64
 _TROUBLES = (OSError, sqlite3.Error, AgentError)
 
 
-def make_spool(queue: QueueConfig, clock: Clock) -> Spool:
-    """The spool that the configuration asks for, ready for use.
+def make_spool(queue: QueueConfig, clock: Clock) -> SqliteSpool:
+    """The spool of a configuration, ready for use.
 
     Raises `AgentError` if the file is in use by another agent or was not made by one.
     """
-    if queue.path is None:
-        return MemorySpool(max_bytes=queue.max_bytes, policy=queue.policy)
+    assert queue.path is not None, "as the configuration is loaded"
     with suppress(OSError):  # the spool tells it, and goes on in memory
         queue.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     spool = SqliteSpool(
@@ -99,7 +98,7 @@ class SqliteSpool:
 
         # Under _lock. First what the file does not have yet.
         self._lock = threading.Lock()
-        self._memory = MemorySpool(max_bytes=self._memory_bytes, policy=policy)
+        self._memory = Memory(max_bytes=self._memory_bytes, policy=policy)
         self._ends: dict[str, RunEnd] = {}
         self._gone: set[int] = set()
         self._told: set[tuple[str, str]] = set()
@@ -162,7 +161,7 @@ class SqliteSpool:
             if not self._overwrite:
                 room = self._max_bytes - self._in_file.payload_bytes
                 self._memory.max_bytes = min(self._memory_bytes, room)
-            self._memory.put(stream, boot, seq, payload, samples=samples)
+            self._memory.put(stream, seq, payload, samples=samples)
             is_full = len(self._memory) >= GROUP_ENTRIES or self._memory.payload_bytes >= GROUP_BYTES
             waited_s = self._clock.monotonic() - self._wrote_at
             self._schedule(0.0 if is_full else max(0.0, GROUP_S - waited_s))
@@ -328,7 +327,7 @@ class SqliteSpool:
             return left is not None and left.id <= last_id
 
     def _move_to_file(self, entries: list[Entry]) -> None:
-        """Batches are in the file now: they leave the memory spool, but for those that may be wanted soon."""
+        """Batches are in the file now: they leave the memory, but for those that may be wanted soon."""
         has_room = len(self._page) < READ_ENTRIES and _bytes(self._page.values()) < READ_BYTES
         if has_room and self._read_to >= self._last_in_file:
             self._read_to = max(self._read_to, entries[-1].id)

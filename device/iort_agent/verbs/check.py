@@ -90,11 +90,8 @@ def _validity(certificate: Certificate) -> Finding:
 
 
 def _queue(config: Config) -> Iterator[Finding]:
-    path: Path | None = config.queue.path
-    if path is None:
-        todo = "remove `queue.path: memory`, for the batches to survive a restart"
-        yield Finding("queue", WARN, "in memory: undelivered batches end with the agent", todo)
-        return
+    path = config.queue.path
+    assert path is not None, "as the configuration is loaded"
     with suppress(OSError):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     target = path if path.exists() else path.parent

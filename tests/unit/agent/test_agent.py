@@ -28,7 +28,6 @@ from iort_agent.sources import Emit, SourceConfig
 from iort_agent.sources.recording import BagConfig
 from iort_agent.sources.sim import SimConfig
 from iort_agent.spool import REJECT_NEW, QueueConfig, Spool
-from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
 from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
@@ -36,7 +35,7 @@ from iort_contract.messages.account import lost
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.messages.commands import DRIVE_TYPE
 from iort_contract.ros1.message import MessageType, message_type
-from testkit.agent import Loopback, Published
+from testkit.agent import Loopback, MemorySpool, Published
 
 T0 = 1_700_000_000_000_000
 RECORD = "$aws/rules/iort_record/dt/iort/car1"

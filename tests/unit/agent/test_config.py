@@ -99,10 +99,8 @@ def test_the_queues_path_is_relative_to_the_file(
 @pytest.mark.parametrize(
     "queue", ["", "queue:\n", "queue: {}\n", "queue: {path: }\n", "queue: {max_bytes: 200000}\n"]
 )
-def test_the_queue_is_on_disk_unless_memory_is_asked_for(folder: Path, queue: str) -> None:
+def test_the_queue_is_beside_the_file_unless_it_says_where(folder: Path, queue: str) -> None:
     assert load_config(write(folder, GOOD + queue)).queue.path == folder / "car1.queue.db"
-    assert load_config(write(folder, GOOD + "queue: {path: memory}\n")).queue.path is None
-    assert load_config(write(folder, GOOD + "queue: {path: ./memory}\n")).queue.path == folder / "memory"
 
 
 @pytest.mark.parametrize(

@@ -19,12 +19,11 @@ from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.runtime import Runtime
 from iort_agent.spool import REJECT_NEW
-from iort_agent.spool.memory import MemorySpool
 from iort_contract.catalog.streams import CATALOG, LOG_STREAM
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.live import decode_live
 from iort_contract.topics import LIVE, RECORD, build_topic
-from testkit.agent import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock, MemorySpool
 from tests.unit.agent.test_agent import Script
 
 T0_S = 1_700_000_000.0

@@ -1,4 +1,4 @@
-"""The spool in memory and on disk: order, bound and policies, then any order of events and faults."""
+"""The spool: order, bound and policies, then any order of events and faults."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 import sqlite3
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from iort_agent.common.threads import SystemClock
-from iort_agent.spool import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW, Entry, QueueConfig, Spool
+from iort_agent.spool import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW, Entry, QueueConfig
 from iort_agent.spool.file import SpoolFile
-from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import RETRY_S, SqliteSpool, make_spool
 from testkit.agent import ManualClock
 from tests.examples import examples
@@ -82,16 +81,10 @@ def crash(spool: SqliteSpool, to: Path) -> Path:
 
 
 def fill(
-    spool: Spool, count: int, size: int = 10, *, stream: str = "vesc", first: int = 0, boot: str = BOOT
+    spool: SqliteSpool, count: int, size: int = 10, *, stream: str = "vesc", first: int = 0, boot: str = BOOT
 ) -> None:
     for seq in range(first, first + count):
         spool.put(stream, boot, seq, b"x" * size, samples=5)
-
-
-def work(spool: Spool) -> None:
-    """What the spool's thread does."""
-    if isinstance(spool, SqliteSpool):
-        spool.work()
 
 
 def retry(spool: SqliteSpool) -> None:
@@ -102,51 +95,37 @@ def retry(spool: SqliteSpool) -> None:
     spool.work()
 
 
-def following(spool: Spool, after: int) -> Any:
+def following(spool: SqliteSpool, after: int) -> Any:
     """The next batch, once it is to hand."""
     for _ in range(2):
         entry = spool.next(after)
         if entry is not None:
             return entry
-        work(spool)
+        spool.work()
     return spool.next(after)
 
 
-def all_kept(spool: Spool) -> list[Entry]:
+def all_kept(spool: SqliteSpool) -> list[Entry]:
     out: list[Entry] = []
     while (entry := following(spool, out[-1].id if out else 0)) is not None:
         out.append(entry)
     return out
 
 
-def kept(spool: Spool) -> list[int]:
+def kept(spool: SqliteSpool) -> list[int]:
     return [entry.seq for entry in all_kept(spool)]
 
 
-# --- what every spool does -----------------------------------------------------------------------------
+# --- order and bound -----------------------------------------------------------------------------------
 
 
-@pytest.fixture(params=["memory", "sqlite"])
-def make(request: pytest.FixtureRequest, path: Path) -> Iterator[Callable[..., Spool]]:
-    spools: list[Spool] = []
-
-    def make_one(**settings: Any) -> Spool:
-        spools.append(MemorySpool(**settings) if request.param == "memory" else spool_at(path, **settings))
-        return spools[-1]
-
-    yield make_one
-    for spool in spools:
-        spool.close()
-
-
-def test_keeps_in_order_until_acknowledged_and_says_when_there_is_a_batch(make: Callable[..., Spool]) -> None:
-    spool = make(max_bytes=1000)
+def test_keeps_in_order_until_acknowledged_and_says_when_there_is_a_batch(path: Path) -> None:
+    spool = spool_at(path, max_bytes=1000)
     offered: list[Any] = []
     spool.on_stored(lambda: offered.append(spool.next(0)))
     fill(spool, 3)
-    if isinstance(spool, SqliteSpool):
-        assert offered == [], "not before it is durable"
-        spool.work()
+    assert offered == [], "not before it is durable"
+    spool.work()
     first = following(spool, 0)
     assert first == offered[0] == (1, "vesc", 0, b"x" * 10, 5)
     fill(spool, 1, stream="rtt")
@@ -158,18 +137,17 @@ def test_keeps_in_order_until_acknowledged_and_says_when_there_is_a_batch(make: 
     assert kept(spool) == [1, 2, 0]
     assert spool.backlog() == (3, 15, 30)
     assert spool.alarm is None
+    spool.close()
 
 
 @pytest.mark.parametrize(("policy", "left"), [(OVERWRITE_OLDEST, [7, 8, 9]), (REJECT_NEW, [0, 1, 2])])
 @pytest.mark.parametrize("at_once", [True, False])
-def test_drops_as_the_policy_says(
-    make: Callable[..., Spool], policy: str, left: list[int], at_once: bool
-) -> None:
-    spool = make(max_bytes=35, policy=policy)
+def test_drops_as_the_policy_says(path: Path, policy: str, left: list[int], at_once: bool) -> None:
+    spool = spool_at(path, max_bytes=35, policy=policy)
     for seq in range(10):
         fill(spool, 1, first=seq)
         if not at_once:
-            work(spool)
+            spool.work()
     fill(spool, 1, size=36, first=10)
     assert kept(spool) == left, "a batch larger than the spool does not empty it"
     assert spool.dropped() == (8, 40)
@@ -179,6 +157,7 @@ def test_drops_as_the_policy_says(
             spool.ack(entry.id)
         fill(spool, 3, first=11)
     assert spool.dropped() == (8, 40), "acknowledgements make room"
+    spool.close()
 
 
 # --- any order of events -------------------------------------------------------------------------------
@@ -378,12 +357,10 @@ def test_of_many_runs_the_newest_are_named_first(path: Path) -> None:
 def test_durability_is_sqlites(path: Path, durability: str, synchronous: int) -> None:
     """2, FULL: the log is synced before COMMIT returns, which is before `next` gives the batch."""
     spool = make_spool(QueueConfig(path=path, durability=durability), SystemClock())
-    assert isinstance(spool, SqliteSpool)
     assert spool._file is not None
     assert spool._file.connection.execute("PRAGMA synchronous").fetchone() == (synchronous,)
     assert spool._file.connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
     spool.close()
-    assert isinstance(make_spool(QueueConfig(), SystemClock()), MemorySpool)
 
 
 def test_after_a_power_cut_the_queue_may_be_older_and_says_no_more_than_it_knows(

@@ -27,13 +27,12 @@ from iort_agent.lanes.streams import StreamCounts
 from iort_agent.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.sources import FAIL, OK, WARN
-from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import StatusServer, ask, fetch, render
 from iort_agent.verbs.check import check, emergency_stop
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.messages.commands import stick_downlink
-from testkit.agent import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock, MemorySpool
 from tests.unit.agent.test_agent import Rig, config_file, drive
 
 

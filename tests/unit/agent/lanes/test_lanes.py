@@ -21,12 +21,11 @@ from iort_agent.lanes.record import Production, Rate, too_many
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import URGENT, RateLimiter
 from iort_agent.runtime import Runtime
-from iort_agent.spool.memory import MemorySpool
 from iort_agent.status import render
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.shadow import ALWAYS
 from iort_contract.topics import BROKER, LIVE
-from testkit.agent import Loopback, ManualClock, Published
+from testkit.agent import Loopback, ManualClock, MemorySpool, Published
 from tests.unit.agent.test_agent import Script
 
 T0 = 1_700_000_000_000_000

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from iort_agent.lanes.record import RecordLane
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import RateLimiter
-from iort_agent.spool.memory import MemorySpool
-from testkit.agent import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock, MemorySpool
 from tests.examples import examples
 
 

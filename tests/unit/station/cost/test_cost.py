@@ -19,7 +19,6 @@ from iort_agent.lanes.pings import CLOCK_EVERY_S
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import SHORTEST_S
 from iort_agent.runtime import Runtime
-from iort_agent.spool.memory import MemorySpool
 from iort_contract.catalog.metrics import METRICS, metrics_of
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.cloud import IOT, PUBNUB
@@ -33,7 +32,7 @@ from iort_station.errors import StationError
 from scripts.docs_parts import ROOT
 from stacks import analysis, archive, storage
 from stacks.settings import Settings
-from testkit.agent import Loopback, ManualClock
+from testkit.agent import Loopback, ManualClock, MemorySpool
 from testkit.car import simulated_drive
 
 # By PubNub, which uses every part of the model.

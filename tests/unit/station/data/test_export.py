@@ -21,7 +21,6 @@ from iort_agent.lanes.streams import BatchEncoder
 from iort_agent.sources import Emit
 from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.sources.recording import BagConfig
-from iort_agent.spool.memory import MemorySpool
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.ros1.decode import Large
@@ -30,7 +29,7 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station.data import bags
 from iort_station.data.export import Export, write
 from iort_station.data.recorded import select
-from testkit.agent import ManualClock
+from testkit.agent import ManualClock, MemorySpool
 from testkit.dynamodb import TELEMETRY, item_of, item_of_message, serialize
 from testkit.ros1_types import HEADER, MESSAGES, Message, fields, header
 from tests.ros1_strategies import definitions, messages
