@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bench.load.cars import Publisher, SimulatedCar, drive
+from bench.load.cars import SimulatedCar, drive
 from bench.proof.fleet import drive_of
 from bench.proof.judging import analysed
 from iort_agent.sources.sim.vehicle import VehicleConfig
@@ -148,13 +148,9 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
         robots.add(cloud.cloud, name, out=folder, settings={**settings, "sources": [{**source, **more}]})
         for name, more in ((_REAL, {"faults": [_FAULT]}), (_HEALTHY, {}))
     ]
-    pubnub = cloud.keys
-    publisher = Publisher(
-        origin=pubnub.origin, publish_key=pubnub.publish_key, subscribe_key=pubnub.subscribe_key
-    )
     cars = [SimulatedCar(f"car{i + 2}", i + 2, senses=i + 1 == _SENSES) for i in range(_FLEET)]
     stop = threading.Event()
-    driving = threading.Thread(target=drive, args=(cars, publisher, stop))
+    driving = threading.Thread(target=drive, args=(cars, cloud.keys, stop))
     events = [
         threading.Timer(30, lambda: setattr(cars[0], "fault_code", 4)),
         threading.Timer(32, lambda: setattr(cars[0], "fault_code", 0)),

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
@@ -32,22 +32,6 @@ _POLICY_STAYS = re.compile(r"DELETE_FAILED.*AWS::IoT::Policy")
 _BUCKET_STAYS = re.compile(r"DELETE_FAILED.*AWS::S3::Bucket")
 # What the answer of a schedule has, and a change does not take.
 _NOT_ITS_OWN = {"Arn", "CreationDate", "LastModificationDate", "ResponseMetadata"}
-
-
-class Upkeep(Protocol):
-    """What the deployment is asked for around its removal."""
-
-    def pause(self) -> None:
-        """Switch the schedules off."""
-
-    def resume(self) -> None:
-        """Switch those on again that are still there."""
-
-    def is_empty(self) -> bool:
-        """Whether the files' bucket can be deleted."""
-
-    def empty(self) -> None:
-        """Delete what came into it since."""
 
 
 class Deployment:
@@ -98,7 +82,7 @@ def main() -> None:
         sys.exit(f"destroy: {error}")
 
 
-def destroy(command: Sequence[str], wait: Callable[[float], None], deployment: Upkeep) -> int:
+def destroy(command: Sequence[str], wait: Callable[[float], None], deployment: Deployment) -> int:
     """Return the command's last exit status; ``wait`` waits the given seconds before each retry."""
     deployment.pause()
     try:

@@ -21,7 +21,6 @@ from iort_agent.common.state import ClockOffset
 from iort_agent.common.threads import SystemClock
 from iort_agent.config import load_config
 from iort_agent.control.questions import Questions
-from iort_agent.errors import AskError
 from iort_agent.files.upload import downloader, make_uploader
 from iort_agent.lanes import PingConfig
 from iort_agent.lanes.pings import Pings
@@ -32,7 +31,6 @@ from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import RTT_FIELDS
 from iort_contract.limits import Value
-from iort_contract.messages.questions import NO_DATA
 from iort_contract.topics import BROKER, PING, PONG, build_topic
 from iort_station.fleet.robots import Bundle
 from testkit import ROOT
@@ -134,21 +132,6 @@ def asking(bundle: Bundle) -> Iterator[Ask]:
                 raise InstrumentError(f"{config.robot} did not hear its answers within {_WAIT_S:g} s")
             pause.wait(0.02)  # the uplink gives no notice of it
         yield lambda name, body: questions.ask(name, body, _WAIT_S)
-
-
-def round_trips_ms(ask: Ask, name: str, *, count: int, rate_hz: float) -> list[float]:
-    """The round trips of a question, in milliseconds, also where the cloud has no data for an answer."""
-    values, pause, began = [], threading.Event(), time.perf_counter()
-    for number in range(count):
-        pause.wait(max(0.0, began + number / rate_hz - time.perf_counter()))
-        sent = time.perf_counter()
-        try:
-            ask(name, {})
-        except AskError as error:
-            if error.reason != NO_DATA:
-                raise InstrumentError(f"the question {name} was refused: {error}") from error
-        values.append((time.perf_counter() - sent) * 1000)
-    return values
 
 
 class Connected:

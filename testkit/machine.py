@@ -5,18 +5,15 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from typing_extensions import Self
-
 from testkit import ROOT
-from testkit.waiting import InstrumentError
 
 _PACKAGES = ("aws-cdk-lib", "boto3", "awsiotsdk", "awscrt", "ministack", "pubnub", "numpy", "playwright")
 
@@ -120,58 +117,3 @@ def _stat(pid: int) -> list[str]:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return []
-
-
-# It takes memory for what is in it only.
-_BYTES = 4 * 2**30
-_TRIES = 100
-
-
-class Disk:
-    """The disk at an empty folder, from `__enter__` to `__exit__`.
-
-    ``within`` is what a command begins with to run where the disk is mounted, if that is not here.
-    """
-
-    def __init__(self, folder: Path, *, within: Sequence[str] = ()) -> None:
-        self.folder, self._within = folder, within
-
-    def __enter__(self) -> Self:
-        self.folder.mkdir(parents=True)
-        self._run("mount", "-t", "tmpfs", "-o", f"size={_BYTES},mode=700", "tmpfs")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._run("umount", "--lazy")
-
-    @contextmanager
-    def full(self) -> Iterator[None]:
-        """No byte is free."""
-        self._fill()
-        try:
-            yield
-        finally:
-            self._resize(_BYTES)
-
-    def _fill(self) -> None:
-        for last in (*[False] * _TRIES, True):
-            blocks, free, size = self._run("stat", "--file-system", "--format=%b %f %S").split()
-            try:
-                self._resize((int(blocks) - int(free)) * int(size))
-            except InstrumentError:
-                # It cannot be smaller than what is in it, and somebody may have written meanwhile.
-                if last:
-                    raise
-            else:
-                return
-
-    def _resize(self, size: int) -> None:
-        self._run("mount", "-o", f"remount,size={size}")
-
-    def _run(self, *command: str) -> str:
-        """Run a command about the folder, and return its output."""
-        whole = [*self._within, *command, str(self.folder)]
-        done = subprocess.run(whole, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise InstrumentError(f"`{' '.join(whole)}` failed: {done.stderr.strip()}")
-        return done.stdout

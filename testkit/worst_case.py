@@ -1,9 +1,4 @@
-"""The most expensive batches for Lambda 2. A hostile robot may send a hundred of them a second.
-
-    python -m testkit.worst_case
-
-Each batch fits into a message. The command measures the processor time to decode and summarise it, without
-any table, and the memory that the decoded batch holds. For a refused batch it prints the reason."""
+"""The most expensive batches for Lambda 2, each within a message. A robot may send a hundred a second."""
 
 from __future__ import annotations
 

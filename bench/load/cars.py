@@ -1,6 +1,6 @@
 """Publishes many simulated cars to PubNub's stand-in, as Lambda 1 does, to measure the page.
 
-python -m bench.load.cars --origin 127.0.0.1:8000 --publish-key P --subscribe-key S --cars 20"""
+python -m bench.load.cars --origin 127.0.0.1:8000 --key K --cars 20"""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from iort_contract.cloud import channel
 from iort_contract.limits import Value
 from iort_contract.messages.live import LiveSample, live_update
 from iort_contract.tables import ROBOT
+from iort_station.page.page import PubNubKeys
 
 _WIDTH, _HEIGHT, _HORIZON = 96, 54, 20
 
@@ -43,21 +44,17 @@ def attachment(robot: str, driven_m: float, yaw_rate_rad_s: float) -> dict[str, 
 
 
 def _jpeg(driven_m: float, yaw_rate_rad_s: float) -> bytes:
+    """A road that bends as the car turns, with a dash that comes nearer as it drives."""
     from PIL import Image, ImageDraw  # noqa: PLC0415 - only the pictures need it
 
     image = Image.new("RGB", (_WIDTH, _HEIGHT), (176, 196, 212))
     draw = ImageDraw.Draw(image)
     draw.rectangle((0, _HORIZON, _WIDTH, _HEIGHT), fill=(96, 104, 88))
-    for y in range(_HORIZON, _HEIGHT):
-        near = (y - _HORIZON) / (_HEIGHT - _HORIZON)
-        middle = _WIDTH / 2 + 26 * yaw_rate_rad_s * (1 - near) ** 2
-        half = 3 + 40 * near
-        draw.line((middle - half, y, middle + half, y), fill=(70, 72, 76))
-        # Dashes come nearer as the car drives.
-        if math.fmod(driven_m + 2 / (near + 0.08), 2) < 1:
-            draw.line((middle - half / 14, y, middle + half / 14, y), fill=(232, 226, 190))
-        for side in (-1, 1):
-            draw.line((middle + side * half, y, middle + side * half * 1.08, y), fill=(214, 92, 60))
+    middle, far = _WIDTH / 2, _WIDTH / 2 + 26 * yaw_rate_rad_s
+    draw.polygon([(middle - 43, _HEIGHT), (far - 3, _HORIZON), (far + 3, _HORIZON), (middle + 43, _HEIGHT)])
+    near = math.fmod(driven_m, 2) / 2
+    y, x = _HORIZON + near * (_HEIGHT - _HORIZON), far + near * (middle - far)
+    draw.line((x, y, x, y + 6 * near), fill=(70, 72, 76), width=2)
     out = io.BytesIO()
     image.save(out, "JPEG", quality=80)
     return out.getvalue()
@@ -132,49 +129,36 @@ class SimulatedCar:
         return live_update(self.name, stream, live, received_ms, now_us - int(_LAMBDA_MS * 1000))
 
 
-class Publisher:
-    """A persistent connection to the stand-in."""
-
-    def __init__(self, *, origin: str, publish_key: str, subscribe_key: str) -> None:
-        self._pool = urllib3.PoolManager(timeout=30)
-        self._url = f"http://{origin}/publish/{publish_key}/{subscribe_key}/0"
-
-    def publish(self, update: Mapping[str, Any]) -> None:
-        """Publish on the robot's channel."""
-        answer = self._pool.request("POST", f"{self._url}/{channel(update[ROBOT])}/0", json=dict(update))
-        if answer.status != http.HTTPStatus.OK:
-            raise OSError(f"the stand-in answered {answer.status}")
-
-
 def drive(
-    cars: list[SimulatedCar], publisher: Publisher, stop: threading.Event, rate_hz: float = RATE_HZ
+    cars: list[SimulatedCar], keys: PubNubKeys, stop: threading.Event, rate_hz: float = RATE_HZ
 ) -> None:
     """Publish every car at ``rate_hz``, evenly spread, until ``stop`` is set."""
-    began, turn = time.monotonic(), 0
+    url = f"http://{keys.origin}/publish/{keys.publish_key}/{keys.subscribe_key}/0"
+    pool, began, turn = urllib3.PoolManager(timeout=30), time.monotonic(), 0
     while not stop.is_set():
         for i, car in enumerate(cars):
             due = began + (turn + i / len(cars)) / rate_hz
             if stop.wait(max(0.0, due - time.monotonic())):
                 return
             for update in car.updates(1 / rate_hz):
-                publisher.publish(update)
+                answer = pool.request("POST", f"{url}/{channel(update[ROBOT])}/0", json=update)
+                if answer.status != http.HTTPStatus.OK:
+                    raise OSError(f"the stand-in answered {answer.status}")
         turn += 1
 
 
 def main() -> None:
     """Drive until standard input ends."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    for name in ("--origin", "--publish-key", "--subscribe-key"):
-        parser.add_argument(name, required=True)
+    parser.add_argument("--origin", required=True)
+    parser.add_argument("--key", required=True, help="to publish, and to subscribe")
     parser.add_argument("--cars", type=int, default=20)
     parser.add_argument("--rate", type=float, default=RATE_HZ, help="Hz, of each car")
     options = parser.parse_args()
-    publisher = Publisher(
-        origin=options.origin, publish_key=options.publish_key, subscribe_key=options.subscribe_key
-    )
+    keys = PubNubKeys(publish_key=options.key, subscribe_key=options.key, origin=options.origin, tls=False)
     cars = [SimulatedCar(f"car{i + 1}", i + 1) for i in range(options.cars)]
     stop = threading.Event()
-    driving = threading.Thread(target=drive, args=(cars, publisher, stop, options.rate))
+    driving = threading.Thread(target=drive, args=(cars, keys, stop, options.rate))
     driving.start()
     sys.stdin.read()
     stop.set()

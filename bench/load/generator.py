@@ -22,7 +22,7 @@ from awsiot import mqtt5_client_builder
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.topics import CMD, PING_PATHS, PONG, build_topic, record_topic
+from iort_contract.topics import record_topic
 from testkit.car import simulated_drive
 
 Columns = dict[str, list[Value]]
@@ -31,7 +31,6 @@ _SECOND_US = 1_000_000
 _LAPS = 60
 _CONNECT_S = 120.0
 _SETTLE_S = 120.0
-_SAY_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -73,29 +72,18 @@ class Robot:
             min_reconnect_delay_ms=500,
             max_reconnect_delay_ms=5_000,
             on_lifecycle_connection_success=lambda _: self.connected.set(),
-            on_lifecycle_disconnection=self._on_lost,
+            on_lifecycle_disconnection=self._disconnected,
         )
 
-    def _on_lost(self, _: Any) -> None:
+    def _disconnected(self, _: Any) -> None:
         self.lost += 1
 
-    def listen(self) -> Future[Any]:
-        """Subscribe as an agent does: the broker compares each message with these."""
-        names = [(CMD, "drive"), (CMD, "stop"), *((PONG, path) for path in PING_PATHS)]
-        topics = [build_topic(lane, self.name, name, self._namespace) for lane, name in names]
-        packet = mqtt5.SubscribePacket(
-            [mqtt5.Subscription(topic, mqtt5.QoS.AT_MOST_ONCE) for topic in topics]
-        )
-        subscribed: Future[Any] = self.client.subscribe(packet)
-        return subscribed
-
-    def send(self, first_us: int | None = None) -> None:
-        """Send the batch of the last second, or of the one that begins then."""
+    def send(self) -> None:
+        """Send the batch of the last second."""
         seq = len(self.sent_ms)
-        if first_us is None:
-            # Like the agent's batches, a batch lies within one second of wall time.
-            self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * _SECOND_US
-            first_us = self._first_us + seq * _SECOND_US
+        # Like the agent's batches, a batch lies within one second of wall time.
+        self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * _SECOND_US
+        first_us = self._first_us + seq * _SECOND_US
         times = [first_us + i * _SECOND_US // self._rate_hz for i in range(self._rate_hz)]
         batch = Batch(self._boot, seq, times, self._columns[seq % len(self._columns)])
         payload = encode_batch(batch)
@@ -142,19 +130,14 @@ def drive(load: Load) -> dict[str, Any]:
             _connected(robots[i - 9 : i + 1])
             _say(connected=i + 1)
     _connected(robots)
-    for subscribed in [robot.listen() for robot in robots]:
-        subscribed.result(_CONNECT_S)
     _say(connected=len(robots), pid=os.getpid())
-    pause, said = threading.Event(), time.monotonic()
-    began = time.monotonic() + 0.1
+    pause, began = threading.Event(), time.monotonic() + 0.1
     for second in range(load.seconds):
         for i, robot in enumerate(robots):
             due = began + second + i / len(robots)
             pause.wait(max(0.0, due - time.monotonic()))
             robot.send()
-        if time.monotonic() - said >= _SAY_S:
-            said = time.monotonic()
-            _say(second=second + 1, acknowledged=sum(len(robot.acknowledged) for robot in robots))
+        _say(second=second + 1)
     until = time.monotonic() + _SETTLE_S
     while any(len(r.acknowledged) < len(r.sent_ms) for r in robots) and time.monotonic() < until:
         pause.wait(0.1)

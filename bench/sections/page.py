@@ -78,9 +78,8 @@ def run(_target: Target | None, say: Say, *, cars: int, rate: float, seconds: fl
 @contextmanager
 def _cars(origin: str, count: int, rate_hz: float) -> Iterator[None]:
     """Run the cars in their own process, which ends when its input does."""
-    keys = ["--publish-key", _KEY, "--subscribe-key", _KEY]
-    command = [sys.executable, "-m", "bench.load.cars", "--origin", origin, *keys, "--cars", str(count)]
-    command += ["--rate", str(rate_hz)]
+    command = [sys.executable, "-m", "bench.load.cars", "--origin", origin, "--key", _KEY]
+    command += ["--cars", str(count), "--rate", str(rate_hz)]
     with subprocess.Popen(command, stdin=subprocess.PIPE):
         yield
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from importlib.metadata import packages_distributions, requires, version
 from pathlib import Path
 
+import grimp
 import pytest
 from packaging.requirements import Requirement
 from setuptools import find_packages
@@ -123,6 +124,12 @@ def test_all_distributions_have_the_contracts_version_and_pin_it() -> None:
     for name in PACKAGES.keys() - {"iort-contract"}:
         (pin,) = (text for text in requires(name) or () if Requirement(text).name == "iort-contract")
         assert pin == f"iort-contract=={one}"
+
+
+def test_the_contract_needs_only_the_standard_library() -> None:
+    graph = grimp.build_graph("iort_contract", include_external_packages=True, cache_dir=None)
+    others = {name for name in graph.modules if not name.startswith("iort_contract")}
+    assert others <= sys.stdlib_module_names
 
 
 def test_a_folder_of_the_page_imports_only_what_its_row_in_the_readme_allows() -> None:

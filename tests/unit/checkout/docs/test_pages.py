@@ -1,8 +1,7 @@
-"""README and docs/ name what exists: paths, modules, links, commands, decisions and tests."""
+"""README and docs/ name what exists: links, commands and decisions."""
 
 from __future__ import annotations
 
-import ast
 import re
 import shlex
 import shutil
@@ -27,20 +26,6 @@ DOCS = sorted(ROOT.glob("docs/**/*.md"))
 # A decision may name a file of its time, and the changelog one that was removed.
 CURRENT = [page for page in DOCS if "decisions" not in page.parts]
 PAGES = [*CURRENT, *ROOT.glob("*/README.md"), *(p for p in ROOT.glob("*.md") if p.name != "CHANGELOG.md")]
-FOLDERS = "bench|contract|device|docs|functions|local|requirements|scripts|stacks|station|tests|verify"
-# `make verify-aws KEEP=1` writes it, and nobody has yet.
-MADE_LATER = {"verify/aws.json"}
-# In backticks or not; a row of docs/how-to/operations.md has `path::test`.
-PATH = re.compile(rf"(?<![\w/.$-])((?:{FOLDERS})/[\w./*-]*\w(?:/|\.\w+)?)")
-MODULE = re.compile(
-    r"`(?:python -m )?((?:bench|iort_agent|iort_contract|iort_station|scripts|tests|verify)(?:\.\w+)+)"
-)
-HOME = {
-    "iort_agent": ROOT / "device",
-    "iort_contract": ROOT / "contract",
-    "iort_analysis": ROOT / "analysis",
-    "iort_station": ROOT / "station",
-}
 COMMAND = re.compile(r"^(?:sudo -u iort )?(?:/opt/iort/bin/)?((?:iort|iort-agent) [a-z-].*)$", re.MULTILINE)
 
 
@@ -65,39 +50,6 @@ def test_a_part_changed_by_hand_is_generated_again(
     assert page.read_text() == text
 
 
-def missing_paths(text: str, folder: Path = ROOT) -> set[str]:
-    named = set(PATH.findall(text)) - MADE_LATER
-    return {path for path in named if not any(ROOT.glob(path)) and not (folder / path).exists()}
-
-
-def missing_modules(text: str) -> set[str]:
-    return {name for name in MODULE.findall(text) if not module_exists(name)}
-
-
-def module_exists(name: str) -> bool:
-    """Whether NAME is a module, a package or a file, or a name that a module's source has."""
-    parts = name.split(".")
-    path = HOME.get(parts[0], ROOT).joinpath(*parts)
-    if path.is_dir() or path.with_suffix(".py").exists() or (ROOT / name).exists():
-        return True
-    parent = path.parent / "__init__.py" if path.parent.is_dir() else path.parent.with_suffix(".py")
-    return parent.exists() and re.search(rf"\b{parts[-1]}\b", parent.read_text()) is not None
-
-
-@each(PAGES)
-def test_every_path_and_module_that_a_page_names_exists(page: Path) -> None:
-    # What a page shows as a new file (how-to-extend.md) is in a fenced block.
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    assert missing_paths(text, page.parent) == set()
-    assert missing_modules(text) == set()
-
-
-def test_a_missing_path_or_module_is_found() -> None:
-    assert missing_paths("see `stacks/nowhere.py`, app.py and docs/how-to/*.md") == {"stacks/nowhere.py"}
-    modules = "`bench.nowhere` and `iort_contract.messages.batch.encode_batch`"
-    assert missing_modules(modules) == {"bench.nowhere"}
-
-
 @each([*DOCS, *ROOT.glob("*.md")])
 def test_every_file_and_heading_that_a_page_links_to_exists(page: Path) -> None:
     for path, anchor in re.findall(r"\]\(([^)#: ]*)(?:#([^)]+))?\)", page.read_text(encoding="utf-8")):
@@ -110,14 +62,6 @@ def anchors(text: str) -> set[str]:
     """The anchors of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
-
-
-@pytest.mark.parametrize("package", HOME)
-def test_the_readme_of_a_package_lists_folders_that_it_has(package: str) -> None:
-    text = (HOME[package] / "README.md").read_text(encoding="utf-8")
-    folders = re.findall(r"^\| `(?:\w+/)?(\w+)` \|", text, re.MULTILINE)
-    assert folders
-    assert [name for name in folders if not (HOME[package] / package / name).is_dir()] == []
 
 
 def test_every_make_target_that_is_named_exists() -> None:
@@ -135,18 +79,6 @@ def test_every_decision_has_its_own_number() -> None:
     assert numbers == sorted(set(numbers))
     for path, number in zip(records, numbers, strict=True):
         assert path.read_text().startswith(f"# {number}. "), path.name
-
-
-def test_every_fault_of_the_operations_page_names_a_test_that_causes_it() -> None:
-    page = (ROOT / "docs/how-to/operations.md").read_text()
-    table = [line for line in page.splitlines() if line.startswith("| ")][1:]
-    assert len(table) > 10
-    for row in table:
-        named = re.findall(r"(tests/[\w/]+\.py)::(\w+)", row)
-        assert named, row
-        for path, function in named:
-            body = ast.parse((ROOT / path).read_text()).body
-            assert function in {node.name for node in body if isinstance(node, ast.FunctionDef)}, row
 
 
 def test_the_agent_reads_the_example_of_car_yaml(tmp_path: Path) -> None:
