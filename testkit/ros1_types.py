@@ -9,6 +9,7 @@ import hashlib
 import re
 import struct
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 SIZES = {
@@ -192,22 +193,12 @@ def fields(message: Message, data: bytes) -> list[tuple[str, object]]:
     return found
 
 
+_BLOCKS = Path(__file__).with_name("ros1_messages.txt").read_text().rstrip().split("\n\nMSG: ")[1:]
+TEXTS = {kind: text for kind, _, text in (block.partition("\n") for block in _BLOCKS)}
+MESSAGES = {kind: Message(kind, TEXTS) for kind in sorted({*TEXTS, HEADER})}
 TYPE = "vesc_msgs/VescStateStamped"
-FIELDS = [
-    "voltage_input",
-    "temperature_pcb",
-    "current_motor",
-    "current_input",
-    "speed",
-    "duty_cycle",
-    "charge_drawn",
-    "charge_regen",
-    "energy_drawn",
-    "energy_regen",
-    "displacement",
-    "distance_traveled",
-]
-STATE = "\n".join([*(f"float64 {name}" for name in FIELDS), "int32 fault_code"])
+_STATE = MESSAGES["vesc_msgs/VescState"].types["vesc_msgs/VescState"]
+FIELDS = [field.name for field in _STATE if field.kind == "float64"]
 # The firmware sends integers; the driver divides these fields by the number, and the others by 1.
 _PARTS = {
     "voltage_input": 10,
@@ -226,75 +217,3 @@ def values(i: int) -> list[float]:
 def body(i: int) -> bytes:
     """Return the i-th message as ROS 1 serializes it, from the frame_id on."""
     return struct.pack(f"<I9s{len(FIELDS)}di", 9, b"base_link", *values(i), 0)
-
-
-TEXTS = {
-    "std_msgs/Empty": "",
-    "std_msgs/String": "string data",
-    "std_msgs/Float32": "float32 data",
-    "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride",
-    "std_msgs/MultiArrayLayout": "MultiArrayDimension[] dim\nuint32 data_offset",
-    "std_msgs/ByteMultiArray": "MultiArrayLayout layout\nbyte[] data",
-    "std_msgs/UInt64MultiArray": "MultiArrayLayout layout\nuint64[] data",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/PointStamped": "Header header\nPoint point",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-    "geometry_msgs/Pose": "Point position\nQuaternion orientation",
-    "geometry_msgs/PoseStamped": "Header header\nPose pose",
-    "geometry_msgs/PoseWithCovariance": "Pose pose\nfloat64[36] covariance",
-    "geometry_msgs/Twist": "Vector3 linear\nVector3 angular",
-    "geometry_msgs/TwistWithCovariance": "Twist twist\nfloat64[36] covariance",
-    "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation",
-    "geometry_msgs/TransformStamped": "Header header\nstring child_frame_id\nTransform transform",
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "sensor_msgs/JointState": (
-        "Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
-    ),
-    "sensor_msgs/Imu": (
-        "Header header\ngeometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
-        "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
-        "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance"
-    ),
-    "sensor_msgs/LaserScan": (
-        "Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\n"
-        "float32 time_increment\nfloat32 scan_time\nfloat32 range_min\nfloat32 range_max\n"
-        "float32[] ranges\nfloat32[] intensities"
-    ),
-    "sensor_msgs/Image": (
-        "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
-        "uint32 step\nuint8[] data"
-    ),
-    "nav_msgs/Odometry": (
-        "Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
-        "geometry_msgs/TwistWithCovariance twist"
-    ),
-    "nav_msgs/Path": "Header header\ngeometry_msgs/PoseStamped[] poses",
-    "nav_msgs/MapMetaData": (
-        "time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose origin"
-    ),
-    "nav_msgs/OccupancyGrid": "Header header\nMapMetaData info\nint8[] data",
-    "diagnostic_msgs/KeyValue": "string key\nstring value",
-    "diagnostic_msgs/DiagnosticStatus": (
-        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\n"
-        "string hardware_id\nKeyValue[] values"
-    ),
-    "diagnostic_msgs/DiagnosticArray": "Header header\nDiagnosticStatus[] status",
-    "vesc_msgs/VescState": STATE,
-    "vesc_msgs/VescStateStamped": "Header header\nVescState state",
-    # Custom types of a lab. A field called header need not be a std_msgs/Header, and a header need not come
-    # first.
-    "lab_msgs/Contact": "Header header\nfloat32 force\nbool touching",
-    "lab_msgs/LabelledContact": "string label\nContact grip",
-    "lab_msgs/Packet": "uint16 id\nuint8 version\nstring note",
-    "lab_msgs/Reading": "Packet header\nfloat64 value\nstd_msgs/Header at",
-    "lab_msgs/Part": "Header header\nReading reading",
-    "lab_msgs/Envelope": "Packet header\nuint8[] payload\nPart[] parts\nPart[2] both",
-    "lab_msgs/Limits": (
-        "uint8 LEFT=0\nstring WHO=a # b\nbool on\nbyte low\nchar letter\nint64 least\nuint64 most\n"
-        "uint64[2] pair\nfloat32 f\nfloat64 d\nfloat64[] list\nbyte[] signed\nstring name\nstring[] names\n"
-        "time at\nduration took\nduration[] tooks"
-    ),
-    "lab_msgs/Empties": "std_msgs/Empty nothing\nstd_msgs/Empty[] many\nfloat64[] none\nPart[] parts",
-}
-MESSAGES = {kind: Message(kind, TEXTS) for kind in sorted({*TEXTS, "std_msgs/Header"})}
