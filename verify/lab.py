@@ -112,6 +112,9 @@ class Lab:
 
     def __init__(self, target: Target) -> None:
         self.target, self.cloud, self.namespace = target, target.cloud, target.cloud.namespace
+        # A client of a service, the name of a question's resource in this run, and a new robot of that name.
+        self.client: Callable[[str], Any] = target.cloud.client
+        self.name, self.robot = target.name, target.robot
         self._exit = ExitStack()
         self.enter, self.undo = self._exit.enter_context, self._exit.callback
 
@@ -121,25 +124,13 @@ class Lab:
     def __exit__(self, *_: object) -> None:
         self._exit.close()
 
-    def client(self, service: str) -> Any:
-        """A boto3 client of the deployment's account."""
-        return self.cloud.client(service)
-
-    def name(self, base: str) -> str:
-        """The name of a question's resource in this run."""
-        return self.target.name(base)
-
     # Robots.
-
-    def robot(self, base: str) -> Bundle:
-        """A new robot of that name."""
-        return self.target.robot(base)
 
     def registered(self, base: str = "verify-victim") -> Bundle:
         """The robot of that name, registered on first use; several questions share it."""
         name = self.name(base)
         folder = self.target.folder / "robots" / name
-        return Bundle(name, folder) if folder.exists() else self.target.robot(base)
+        return Bundle(name, folder) if folder.exists() else self.robot(base)
 
     def removed_after(self, base: str) -> Removed:
         """The name of a robot that the question registers itself."""
@@ -206,13 +197,10 @@ class Lab:
             "the batches' stream in the robot's row",
         )
 
-    def listed(self, robot: str) -> list[DeadLetter]:
-        """The robot's entries in the quarantine, without their messages."""
-        return list(quarantine.entries(self.cloud, robot=robot))
-
     def entries(self, robot: str) -> list[DeadLetter]:
         """The robot's entries in the quarantine, with their messages."""
-        return [whole for entry in self.listed(robot) if (whole := quarantine.load(self.cloud, entry))]
+        listed = quarantine.entries(self.cloud, robot=robot)
+        return [whole for entry in listed if (whole := quarantine.load(self.cloud, entry))]
 
     def only_entry(self, robot: str, *, within_s: float = 90.0) -> DeadLetter:
         """Wait for the robot's entry in the quarantine. Raises `InstrumentError` if there are several."""

@@ -1,9 +1,8 @@
-"""The delay from the car to a PubNub subscriber, hop by hop, and to a painted frame in Chromium."""
+"""The delay from the car to a PubNub subscriber, and to a painted frame in Chromium."""
 
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -12,10 +11,7 @@ from typing import Any
 from bench.report import Section, text
 from bench.sections import Declared
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.page import PUBNUB_ORIGIN
-from iort_station.operations import audit, trace
 from iort_station.page.page import BUILT, load_keys
-from iort_station.page.pubnub import Listener
 from iort_station.page.server import PageServer
 from local.figures import THESIS, Spread
 from testkit import chromium
@@ -54,44 +50,33 @@ def run(target: Target, say: Say) -> Section:
     bundle = target.robot(
         "bench-dashboard",
         sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}],
-        metrics={"every_s": 1},
         live={"when": "always"},
-        ping={"rate_hz": 1},
-    )
-    pubnub = load_keys(target.cloud)
-    updates: list[trace.Times] = []
-    listener = Listener(
-        robot=bundle.robot,
-        namespace=target.cloud.namespace,
-        on_update=lambda update, at, here: updates.append(trace.times(update, at, here)),
-        **pubnub.reading(),
     )
     painted: list[tuple[float, float]] = []
-    with listener, trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
-        here = trace.clock_of(ask, lambda: time.time_ns() // 1000)
-        with AgentProcess(bundle) as agent, _page(target, bundle.robot, say) as page:
-            threading.Event().wait(_WARM_UP_S)
-            updates.clear()
-            say(f"driving for {SECONDS} s")
-            if page is not None:
-                page.evaluate(_WATCH, bundle.robot)
-                page.wait_for_timeout(SECONDS * 1000)
-                painted = page.evaluate("window.__painted")
-            else:
-                threading.Event().wait(SECONDS)
-            if agent.process.poll() is not None:
-                raise InstrumentError("the agent stopped while it was watched")
-            heard = list(updates)
-        figures = audit.last_figures(target.cloud, bundle.robot)
-    if not heard:
+    with (
+        target.listener(bundle.robot) as listener,
+        AgentProcess(bundle) as agent,
+        _page(target, bundle.robot, say) as page,
+    ):
+        threading.Event().wait(_WARM_UP_S)
+        before = len(listener.heard)
+        say(f"driving for {SECONDS} s")
+        if page is not None:
+            page.evaluate(_WATCH, bundle.robot)
+            page.wait_for_timeout(SECONDS * 1000)
+            painted = page.evaluate("window.__painted")
+        else:
+            threading.Event().wait(SECONDS)
+        if agent.process.poll() is not None:
+            raise InstrumentError("the agent stopped while it was watched")
+        heard_ms = [update.delay_ms for update in listener.heard[before:]]
+    if not heard_ms:
         raise InstrumentError("no live update was heard")
-    hops = trace.trace(heard, here_to_pubnub=here, car_uncertainty_ms=figures.get("clock_uncertainty_ms"))
-    heard_ms = [(update.here_us - update.sample_us) / 1000 for update in heard]
-    return report(hops, heard_ms, [at - t / 1000 for t, at in painted])
+    return report(heard_ms, [at - t / 1000 for t, at in painted])
 
 
-def report(hops: trace.Trace, heard_ms: list[float], shown_ms: list[float]) -> Section:
-    """Make the section of the hops and the delays."""
+def report(heard_ms: list[float], shown_ms: list[float]) -> Section:
+    """Make the section of the delays to a subscriber, and to a frame."""
     section, thesis = Section("dashboard", "To the dashboard"), f"{THESIS['dashboard']} ms"
     section.table(
         "From the sample in the car, by this machine's one clock where the car is simulated on it",
@@ -101,28 +86,20 @@ def report(hops: trace.Trace, heard_ms: list[float], shown_ms: list[float]) -> S
             ["car to painted frame in Chromium", text([shown_ms]), thesis],
         ],
     )
-    rows = []
-    for hop in [*hops.hops, hops.whole]:
-        doubt = "not known" if hop.uncertainty_ms is None else f"{hop.uncertainty_ms:.2f} ms"
-        rows.append([hop.name, f"{hop.p50_ms:.2f} ms", f"{hop.p95_ms:.2f} ms", doubt])
-    section.table("Hop by hop", ["hop", "median", "p95", "clocks may falsify it by"], rows)
     # To the subscriber it is a few milliseconds through five processes, which vary more than a frame does.
     for way, delays_ms, most, tolerance in (
         ("subscriber", heard_ms, 1.0, 8.0),
         ("pixel", shown_ms, 0.15, 2.5),
     ):
-        took = Spread.of(delays_ms).p50
-        name, share = f"car to {way} / thesis' {_THESIS_MS} ms", took and took / _THESIS_MS
+        delay = Spread.of(delays_ms)
+        name, share = f"car to {way} / thesis' {_THESIS_MS} ms", delay.p50 and delay.p50 / _THESIS_MS
         section.ratio(name, share, most, tolerance=tolerance, by_machine=True)
+        section.raw[way] = asdict(delay)
     section.notes.append(
-        "A painted frame is the first one after the update's that the browser has handed over; Chromium "
-        "draws 60 a second without a display, so half a frame of the delay is waiting for the next."
+        "`iort trace` tells the delay hop by hop. A painted frame is the first one after the update's that "
+        "the browser has handed over; Chromium draws 60 a second without a display, so half a frame of the "
+        "delay is waiting for the next."
     )
-    section.raw = {
-        "hops": asdict(hops),
-        "subscriber_ms": asdict(Spread.of(heard_ms)),
-        "painted_ms": asdict(Spread.of(shown_ms)),
-    }
     return section
 
 

@@ -1,8 +1,8 @@
 """Table 6.5: the time and processor time of the functions and of the robot's node.
 
-Durations come from Lambda's REPORT lines. The embedded cloud gives every function a whole core, whatever its
-memory size, so there the operating system also measures the processor time. Beside the functions run their
-floors (`bench.floors`), with the same events in turns. Cold starts are a section of their own."""
+On AWS durations come from Lambda's REPORT lines. The embedded cloud gives every function a whole core,
+whatever its memory size: there the operating system measures the processor time. Beside the functions run
+their floors (`bench.floors`), with the same events in turns. Cold starts are a section of their own."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from iort_contract.topics import LIVE, RECORD, build_topic
 from testkit import machine
 from testkit.car import RATE_HZ
 from testkit.target import Say, Target, configure, temporary_function
-from testkit.waiting import InstrumentError, reached
+from testkit.waiting import InstrumentError
 
 ROBOT = "bench-functions"
 ROUNDS, CALLS, BATCHES = 3, 60, 100
@@ -48,7 +48,6 @@ _MOST = 3.0
 _THESIS = {_LIVE: thesis.LAMBDA_1, _ONE: thesis.LAMBDA_2}
 # What an invocation costs by itself.
 _NOTHING = "def handler(event, context):\n    return None\n"
-_LOGS_S = 60.0
 _REPORT = re.compile(r"^REPORT .*?\tDuration: ([\d.]+) ms.*", re.MULTILINE)
 # Time enough that a robot's share of Lambda 2 is whole again.
 _ARRIVES_EVERY_S = 10
@@ -58,7 +57,7 @@ Event = Callable[[int], dict[str, Any]]
 
 @dataclass
 class Measured:
-    """A function's durations in ms, a list a round; and on the embedded cloud its processor time an
+    """A function's durations on AWS in ms, a list a round; and on the embedded cloud its processor time an
     invocation, in ms for each round."""
 
     duration_ms: list[list[float]] = field(default_factory=list)
@@ -66,20 +65,12 @@ class Measured:
 
 
 def measure(target: Target, function: str, event: Event, calls: int, measured: Measured) -> None:
-    """Invoke the function ``calls`` times, one after the other, and add the round to ``measured``.
-
-    Raises `InstrumentError` where an invocation fails, or no REPORT line comes.
-    """
-    began_ms = int(time.time() * 1000)
+    """Invoke the function ``calls`` times, one after the other, and add the round to ``measured``."""
     before = _cpu(target)
-    answers = [invoke(target, function, event(i)) for i in range(calls)]
+    durations_ms = [invoke(target, function, event(i)) for i in range(calls)]
     if target.embedded is not None:
         measured.cpu_ms.append(machine.spent_ms(before, _cpu(target)) / calls)
-    # AWS' answers end with the REPORT line; the embedded cloud writes it to the log, which nobody else uses.
-    durations = [duration for duration in answers if duration is not None]
-    if len(durations) < calls:
-        durations = _logged(target, function, began_ms, calls)
-    measured.duration_ms.append(durations)
+    measured.duration_ms.append([duration for duration in durations_ms if duration is not None])
 
 
 def _cpu(target: Target) -> dict[int, int]:
@@ -88,7 +79,7 @@ def _cpu(target: Target) -> dict[int, int]:
 
 
 def invoke(target: Target, function: str, event: dict[str, Any]) -> float | None:
-    """Run the function once; return its duration, if the answer has it. Raises `InstrumentError`."""
+    """Run the function once; return its duration, which AWS' answer has. Raises `InstrumentError`."""
     answer = target.cloud.client("lambda").invoke(
         FunctionName=function, Payload=json.dumps(event).encode(), LogType="Tail"
     )
@@ -103,32 +94,12 @@ def duration_ms(log: str) -> float | None:
     return None if match is None else float(match[1])
 
 
-def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[float]:
-    """Wait for the REPORT lines since ``began_ms`` in the function's log, and return their durations."""
-    configuration = target.cloud.client("lambda").get_function_configuration(FunctionName=function)
-    group = configuration.get("LoggingConfig", {}).get("LogGroup", f"/aws/lambda/{function}")
-    logs = target.cloud.client("logs").get_paginator("filter_log_events")
-    durations: list[float] = []
-
-    def all_there() -> bool:
-        pages = logs.paginate(logGroupName=group, startTime=began_ms, filterPattern="REPORT")
-        lines = (duration_ms(event["message"]) for page in pages for event in page["events"])
-        durations[:] = [duration for duration in lines if duration is not None]
-        return len(durations) >= calls
-
-    if not reached(all_there, within_s=_LOGS_S, poll_s=0.5) and not durations:
-        raise InstrumentError(
-            f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all"
-        )
-    return durations
-
-
 @contextmanager
 def reporting(target: Target, function: str) -> Iterator[None]:
-    """Have Lambda write REPORT lines; the stacks leave them out (`function_logs`)."""
+    """Have AWS write REPORT lines; the stacks leave them out (`function_logs`)."""
     client = target.cloud.client("lambda")
     was = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
-    if was.get("LogFormat") != "JSON":
+    if target.embedded is not None or was.get("LogFormat") != "JSON":
         yield
         return
     try:

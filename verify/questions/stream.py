@@ -105,7 +105,7 @@ def bisected(lab: Lab) -> Seen:
         numbers = list(dict.fromkeys(number for event in good for number in event))
         return numbers if len(numbers) == _COUNT - 1 else None
 
-    until(lambda: lab.listed(robot), "the poisoned batch in the quarantine", within_s=_WITHIN_S)
+    until(lambda: lab.entries(robot), "the poisoned batch in the quarantine", within_s=_WITHIN_S)
     good, seen = until(passed, "the batches around the poisoned one", within_s=_WITHIN_S), events()
     given_up = lab.entries(robot)
     outcomes = list(replay(lab.cloud, given_up))
@@ -115,7 +115,7 @@ def bisected(lab: Lab) -> Seen:
         "passed_in_order": good,
         "fields": sorted({name for event in seen for name in event["fields"]}),
         "replayed": [outcome.fate.value for outcome in outcomes],
-        "left": len(lab.listed(robot)),
+        "left": len(lab.entries(robot)),
         "note_events": [event["numbers"] for event in seen],
     }
 
@@ -165,7 +165,7 @@ def reported(lab: Lab) -> Seen:
         "times_reported": len(reporting),
         "comes_next": [events[i + 1][0] for i in reporting],
         "again_before_it": [number for number in range(_REPORTED) if seen.count(number) > 1],
-        "in_quarantine": len(lab.listed(robot)),
+        "in_quarantine": len(lab.entries(robot)),
         "note_events": events,
     }
 
@@ -225,5 +225,5 @@ def replayed(lab: Lab) -> Seen:
         "before": before,
         "fate": outcome.fate.value,
         "summarized": _summarized(lab, robot),
-        "left": len(lab.listed(robot)),
+        "left": len(lab.entries(robot)),
     }
