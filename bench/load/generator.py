@@ -10,73 +10,47 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from awscrt import mqtt5
-from awsiot import mqtt5_client_builder
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import record_topic
 from testkit.car import simulated_drive
+from testkit.mqtt import Robot
+from testkit.waiting import reached
 
 Columns = dict[str, list[Value]]
 _SECOND_US = 1_000_000
 # Laps are one second long; robots start at different ones.
 _LAPS = 60
-_CONNECT_S = 120.0
 _SETTLE_S = 120.0
 
 
 @dataclass(frozen=True)
 class Load:
-    """The robots, each with the folder of its keys, the duration, the rate and the address of the broker."""
+    """The robots, each with the folder of its keys, the duration and the rate."""
 
     robots: dict[str, str]
     namespace: str
-    host: str
-    port: int
     seconds: int
     rate_hz: int
 
 
-class Robot:
-    """One robot with its own session; it sends batches of a second, numbered from 0."""
+class Car:
+    """One robot, which sends batches of a second, numbered from 0."""
 
-    def __init__(
-        self, name: str, folder: Path, load: Load, columns: Sequence[dict[str, list[Value]]]
-    ) -> None:
-        self.name = name
-        self._columns, self._namespace = columns, load.namespace
-        self._topic = record_topic(name, VESC_STREAM, load.namespace)
-        self._boot, self._first_us, self._rate_hz = os.urandom(4).hex(), 0, load.rate_hz
-        self.connected = threading.Event()
-        self.lost = self.resent = 0
+    def __init__(self, robot: Robot, load: Load, columns: list[Columns]) -> None:
+        self.robot, self._columns, self._rate_hz = robot, columns, load.rate_hz
+        self._topic = record_topic(robot.name, VESC_STREAM, load.namespace)
+        self._boot, self._first_us = os.urandom(4).hex(), 0
+        self.resent = 0
         self.sent_ms: list[int] = []
         self.ack_ms: list[float] = []
-        self.acknowledged: set[int] = set()
-        self.client = mqtt5_client_builder.mtls_from_path(
-            str(folder / "certificate.pem"),
-            str(folder / "private.key"),
-            endpoint=load.host,
-            port=load.port,
-            ca_filepath=str(folder / "root-ca.pem"),
-            client_id=name,
-            keep_alive_interval_sec=60,
-            ack_timeout_sec=60,
-            min_reconnect_delay_ms=500,
-            max_reconnect_delay_ms=5_000,
-            on_lifecycle_connection_success=lambda _: self.connected.set(),
-            on_lifecycle_disconnection=self._disconnected,
-        )
-
-    def _disconnected(self, _: Any) -> None:
-        self.lost += 1
 
     def send(self) -> None:
         """Send the batch of the last second."""
@@ -85,24 +59,20 @@ class Robot:
         self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * _SECOND_US
         first_us = self._first_us + seq * _SECOND_US
         times = [first_us + i * _SECOND_US // self._rate_hz for i in range(self._rate_hz)]
-        batch = Batch(self._boot, seq, times, self._columns[seq % len(self._columns)])
-        payload = encode_batch(batch)
+        payload = encode_batch(Batch(self._boot, seq, times, self._columns[seq % _LAPS]))
         self.sent_ms.append(time.time_ns() // 1_000_000)
-        self._publish(seq, payload, time.monotonic())
+        self._publish(payload, time.monotonic())
 
-    def _publish(self, seq: int, payload: bytes, began: float) -> None:
-        packet = mqtt5.PublishPacket(topic=self._topic, payload=payload, qos=mqtt5.QoS.AT_LEAST_ONCE)
-
+    def _publish(self, payload: bytes, began: float) -> None:
         def done(future: Future[Any]) -> None:
             if future.exception() is None and future.result().puback.reason_code == 0:
-                self.acknowledged.add(seq)
                 self.ack_ms.append((time.monotonic() - began) * 1000)
             else:
                 # Not from here: the client's own thread must not wait.
                 self.resent += 1
-                threading.Timer(1.0, self._publish, (seq, payload, began)).start()
+                threading.Timer(1.0, self._publish, (payload, began)).start()
 
-        self.client.publish(packet).add_done_callback(done)
+        self.robot.send(self._topic, payload).add_done_callback(done)
 
 
 def laps(rate_hz: int) -> list[Columns]:
@@ -118,54 +88,32 @@ def drive(load: Load) -> dict[str, Any]:
     Returns resent batches, lost sessions, ms to the acknowledgements, and by robot the times at which its
     batches left, in ms since the epoch.
     """
-    seconds = laps(load.rate_hz)
-    robots = [
-        Robot(name, Path(folder), load, seconds[i % _LAPS :] + seconds[: i % _LAPS])
-        for i, (name, folder) in enumerate(load.robots.items())
-    ]
-    for i, robot in enumerate(robots):
-        robot.client.start()
-        # Connect in small groups, like a fleet that is switched on by hand.
-        if i % 10 == 9:
-            _connected(robots[i - 9 : i + 1])
-            _say(connected=i + 1)
-    _connected(robots)
-    _say(connected=len(robots), pid=os.getpid())
-    pause, began = threading.Event(), time.monotonic() + 0.1
-    for second in range(load.seconds):
-        for i, robot in enumerate(robots):
-            due = began + second + i / len(robots)
-            pause.wait(max(0.0, due - time.monotonic()))
-            robot.send()
-        _say(second=second + 1)
-    until = time.monotonic() + _SETTLE_S
-    while any(len(r.acknowledged) < len(r.sent_ms) for r in robots) and time.monotonic() < until:
-        pause.wait(0.1)
-    for robot in robots:
-        robot.client.stop()
+    seconds, cars = laps(load.rate_hz), list[Car]()
+    with ExitStack() as stack:
+        # One after the other, like a fleet that is switched on by hand.
+        for i, folder in enumerate(load.robots.values()):
+            robot = stack.enter_context(Robot(Path(folder))).online()
+            cars.append(Car(robot, load, seconds[i % _LAPS :] + seconds[: i % _LAPS]))
+        _say(connected=len(cars), pid=os.getpid())
+        pause, began = threading.Event(), time.monotonic() + 0.1
+        for second in range(load.seconds):
+            for i, car in enumerate(cars):
+                pause.wait(max(0.0, began + second + i / len(cars) - time.monotonic()))
+                car.send()
+            _say(second=second + 1)
+        reached(lambda: all(len(car.ack_ms) >= load.seconds for car in cars), within_s=_SETTLE_S)
+        lost = sum(car.robot.lost.is_set() for car in cars)
     return {
-        "resent": sum(robot.resent for robot in robots),
-        "lost_sessions": sum(robot.lost for robot in robots),
-        "ack_ms": [round(ms, 3) for robot in robots for ms in robot.ack_ms],
-        "sent_ms": {robot.name: robot.sent_ms for robot in robots},
+        "resent": sum(car.resent for car in cars),
+        "lost_sessions": lost,
+        "ack_ms": [round(ms, 3) for car in cars for ms in car.ack_ms],
+        "sent_ms": {car.robot.name: car.sent_ms for car in cars},
     }
-
-
-def _connected(robots: Sequence[Robot]) -> None:
-    deadline = time.monotonic() + _CONNECT_S
-    for robot in robots:
-        if not robot.connected.wait(max(0.0, deadline - time.monotonic())):
-            sys.exit(f"{robot.name} was not connected within {_CONNECT_S:.0f} s")
 
 
 def _say(**what: Any) -> None:
     print(json.dumps(what), flush=True)
 
 
-def main() -> None:
-    """Drive the load of the argument."""
-    _say(sent=drive(Load(**json.loads(Path(sys.argv[1]).read_text()))))
-
-
 if __name__ == "__main__":
-    main()
+    _say(sent=drive(Load(**json.loads(Path(sys.argv[1]).read_text()))))

@@ -97,7 +97,7 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, rate_hz: int, say
     with tempfile.TemporaryDirectory() as folder:
         say(f"{count} robots: registering and connecting")
         bundles = {name: str(registered.add(cloud, name, out=Path(folder)).folder) for name in names}
-        load = Load(bundles, cloud.namespace, cloud.mqtt_endpoint, cloud.mqtt_port, seconds, rate_hz)
+        load = Load(bundles, cloud.namespace, seconds, rate_hz)
         file = Path(folder) / "load.json"
         file.write_text(json.dumps(asdict(load)))
         with process("bench.load.generator", str(file)) as generator:
