@@ -100,14 +100,8 @@ def build(folder: Path, layer: Layer, compiler: str | None) -> None:
         [
             *(UV, "pip", "install", "--quiet", *LOCKED),
             *("--python", sys.executable, "--python-version", target.python, *platform),
-            *(
-                "--target",
-                packages,
-                "--link-mode",
-                "copy",
-                "--requirements",
-                ROOT / "requirements" / layer.requirements,
-            ),
+            *("--target", packages, "--link-mode", "copy"),
+            *("--requirements", ROOT / "requirements" / layer.requirements),
         ],
         check=True,
     )

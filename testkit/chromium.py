@@ -11,7 +11,6 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from typing_extensions import Self
@@ -39,6 +38,13 @@ def found() -> str | None:
     return os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 
 
+def _program() -> str:
+    program = found()
+    if program is None:
+        raise InstrumentError("there is no chromium here: apt-get install chromium, or name it in CHROMIUM")
+    return program
+
+
 @contextmanager
 def opened() -> Iterator[Browser]:
     """Yield a browser. Raises `InstrumentError` without one."""
@@ -46,9 +52,7 @@ def opened() -> Iterator[Browser]:
         from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only who has a browser needs it
     except ImportError as error:
         raise InstrumentError("playwright is not installed: run `make setup`") from error
-    program = found()
-    if program is None:
-        raise InstrumentError("there is no chromium here: apt-get install chromium, or name it in CHROMIUM")
+    program = _program()
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=program, args=list(FLAGS))
         try:
@@ -69,25 +73,18 @@ class Tabs:
         self.url = ""
 
     def __enter__(self) -> Self:
-        program = found()
-        if program is None:
-            raise InstrumentError(
-                "there is no chromium here: apt-get install chromium, or name it in CHROMIUM"
-            )
         own = ("--headless=new", "--remote-debugging-port=0", f"--user-data-dir={self._profile}")
         self._process = subprocess.Popen(
-            [program, *FLAGS, *own, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
+            [_program(), *FLAGS, *own, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
         )
-        told = self._profile / "DevToolsActivePort"
-        if not reached(lambda: told.exists() and told.read_text(), within_s=_START_S):
+        port = self._profile / "DevToolsActivePort"
+        if not reached(lambda: port.exists() and port.read_text(), within_s=_START_S):
             self._process.kill()
             raise InstrumentError("chromium does not start")
-        self.url = f"http://127.0.0.1:{told.read_text().split()[0]}"
+        self.url = f"http://127.0.0.1:{port.read_text().split()[0]}"
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.signal(signal.SIGCONT)
         self._process.terminate()
         self._process.wait()

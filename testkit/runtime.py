@@ -229,19 +229,14 @@ class Environment:
     services: Services
     process: subprocess.Popen[bytes]
     start_cpu_ms: float = 0.0
-    start_ms: float = 0.0
     printed: list[str] = field(default_factory=list)
     logged: list[str] = field(default_factory=list)
 
-    def wait_for_start(self, began: float) -> None:
-        """Wait until the runtime asks for its first event; ``began`` is the monotonic time of the start.
-
-        Raises `RuntimeFailedError` if it ends before.
-        """
+    def wait_for_start(self) -> None:
+        """Wait until the runtime asks for its first event. Raises `RuntimeFailedError` if it ends before."""
         first = self._call()
         if first.kind != NEXT:
             raise RuntimeFailedError(str(first.document))
-        self.start_ms = (time.monotonic() - began) * 1000
         self.start_cpu_ms = self.cpu_ms()
 
     def invoke(self, event: dict[str, Any]) -> Call:
@@ -286,7 +281,6 @@ def started(function: Function, folder: Path, *, python: str = sys.executable) -
     link_runtime(own)
     printed, logged = folder / "printed", folder / "logged"
     with served(api, services) as address, printed.open("wb") as out, logged.open("wb") as log:
-        began = time.monotonic()
         process = subprocess.Popen(
             # -S and -s: only the linked packages of this environment are on the path.
             [python, "-S", "-s", "-m", "awslambdaric", function.handler],
@@ -299,7 +293,7 @@ def started(function: Function, folder: Path, *, python: str = sys.executable) -
         )
         found = Environment(api, services, process)
         try:
-            found.wait_for_start(began)
+            found.wait_for_start()
             yield found
         finally:
             process.kill()

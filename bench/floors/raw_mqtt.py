@@ -16,7 +16,6 @@ import struct
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import yaml
@@ -46,14 +45,11 @@ class RawClient:
             bundle / self._config["certificate"], bundle / self._config["private_key"]
         )
         self._socket: ssl.SSLSocket
-        self.tcp_connect_s = 0.0
 
     def __enter__(self) -> Self:
         host = self._config["endpoint"]
-        began = time.perf_counter()
         plain = socket.create_connection((host, self._port), timeout=_TIMEOUT_S)
         plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.tcp_connect_s = time.perf_counter() - began
         self._socket = self._context.wrap_socket(plain, server_hostname=host)
         name = self._config["robot"].encode()
         body = b"\x00\x04MQTT\x04\x02\x00\x3c" + _text(name)
@@ -62,9 +58,7 @@ class RawClient:
             raise RawError("the broker refused the connection")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with suppress(OSError):  # the broker may have closed first
             self._send(0xE0, _NOTHING)
         self._socket.close()

@@ -1,4 +1,4 @@
-"""The verdicts of some questions, with fake clouds that answer as assumed or differently."""
+"""The verdicts of questions that the embedded cloud cannot be asked, with fake clouds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import json
 from types import SimpleNamespace
 
 import pytest
-from botocore.exceptions import ClientError
 
 from testkit.target import AWS
 from verify.question import Verdict, ask
@@ -36,40 +35,6 @@ def verdict(name, cloud):
     target = SimpleNamespace(kind=AWS, cloud=cloud, name=str, robot=lambda base: SimpleNamespace(robot=base))
     answer = ask(QUESTIONS[name], target, itertools.count().__next__)
     return answer.verdict, answer.seen or answer.reason
-
-
-def refuse(code, **more):
-    metadata = {"HTTPStatusCode": 400}
-    raise ClientError({"Error": {"Code": code}, "ResponseMetadata": metadata, **more}, "Operation")
-
-
-@pytest.mark.parametrize(
-    ("reserved", "expected"),
-    [
-        ({"batch", "online"}, Verdict.AS_ASSUMED),
-        ({"batch"}, Verdict.DIFFERS),
-        ({"batch", "online", "serial"}, Verdict.DIFFERS),
-    ],
-)
-def test_reserved_words_are_compared_with_the_assumption(reserved, expected):
-    def get_item(*, ProjectionExpression, **_):
-        if ProjectionExpression in reserved:
-            refuse("ValidationException")
-
-    assert verdict("dynamodb.reserved_words", Cloud(get_item=get_item))[0] is expected
-
-
-def test_an_unexpected_error_is_a_failed_question():
-    cloud = Cloud(get_item=lambda **_: refuse("AccessDeniedException"))
-    assert verdict("dynamodb.reserved_words", cloud)[0] is Verdict.FAILED
-
-
-@pytest.mark.parametrize(("row", "expected"), [(True, Verdict.AS_ASSUMED), (False, Verdict.DIFFERS)])
-def test_the_answer_to_a_failed_condition_is_compared_with_the_assumption(row, expected):
-    def update_item(*, Key, **_):
-        refuse("ConditionalCheckFailedException", **({"Item": Key} if row else {}))
-
-    assert verdict("dynamodb.failed_condition", Cloud(update_item=update_item))[0] is expected
 
 
 @pytest.mark.parametrize(
