@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
 from iort_analysis.archive.hours import HourFile, is_expiring, key_of
-from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.stored import HEADER, ahead
-from iort_analysis.archive.writing import described, write_day
 from iort_analysis.samples.batches import Item
 from iort_contract import archive
 from iort_contract.dynamodb import WRITE_ITEMS, Keys, TableError, TelemetryTable, starting_between, whole
@@ -64,16 +61,16 @@ def merge_hours(
     units_per_s: int = UNITS_PER_S,
     progress: BatchProgress = lambda _batches: None,
 ) -> int:
-    """Copy what only the source's archive still has of hours that both have archived, into the target's
-    table, from where its own archive takes it up; returns the number of batches."""
+    """Copy what only the source's archive still has, of hours that `copy_hours` has not copied, into the
+    target's table, from where its own archive takes it up; returns the number of batches."""
     ours, theirs = archive_of(source, topic), archive_of(target, topic)
     there = {row.hour: row for row in theirs.rows()}
     table, batches = telemetry_table(target), 0
     for row in ours.rows():
         their = there.get(row.hour)
-        if their is None or their.content == row.content or not is_expiring(row):
+        if not is_expiring(row) or (their is not None and their.content == row.content):
             continue
-        known = set(theirs.read(their, HourFile.ids))
+        known = set() if their is None else set(theirs.read(their, HourFile.ids))
         old = [item for item in ours.read(row, HourFile.items) if key_of(item) not in known]
         expires = {EXPIRES_S: {"N": str(int(time.time()) + _MERGED_S)}}
         new = [{**item, **expires} for item in _lacking(target, topic, old)]
@@ -110,47 +107,30 @@ def write(table: TelemetryTable, items: Sequence[Mapping[str, Any]], units_per_s
         time.sleep(max(0.0, began + units / units_per_s - time.monotonic()))
 
 
-# Moves a stream's archived hours: the objects and the manifest's rows.
+def copy_hours(source: Cloud, target: Cloud, topic: str) -> int:
+    """Copy the archived hours that the target lacks, their objects first and the manifest's row last; returns
+    how many.
 
-
-class Hours(NamedTuple):
-    """The hours that were copied, and those that were ``left`` since the target is about to write them."""
-
-    copied: int
-    left: int
-
-
-def copy_hours(source: Cloud, target: Cloud, topic: str) -> Hours:
-    """Copy the hours that the target lacks; the manifest's row comes last.
-
-    An hour that both have stays as it is: `merge_hours` copies what the target lacks.
+    None of the target's objects and rows is replaced: `merge_hours` copies what the target lacks of an hour
+    that both have, and of a day of which the target has another object.
     """
-    there = {row.hour for row in archive_of(target, topic).rows()}
-    copied = left = 0
-    copies = _Objects(source, target)
+    there, copied = {row.hour for row in archive_of(target, topic).rows()}, 0
+    objects: dict[str, bool] = {}
     for row in archive_of(source, topic).rows():
         if row.hour in there:
             continue
-        new: archive.ArchivedHour | None = row
-        if row.key and not copies.copy(row.key, row.sha256):
-            # The target has another object of this day, with hours of its own.
-            new = copies.copy_hour(row)
+        # A day's hours are in one object.
+        if row.key and row.key not in objects:
+            objects[row.key] = _copy_object(source, target, row.key, row.sha256)
         refused = archive.refused_key(parse_topic(topic), archive.parse_hour(row.hour))
-        if new and (not row.refused or copies.copy(refused)) and _put_row(target, new):
-            copied += 1
-        else:
-            left += 1
-    return Hours(copied, left)
-
-
-def _put_row(target: Cloud, row: archive.ArchivedHour) -> bool:
-    """Write a row; returns False if the target has one of this hour by now."""
-    return _is_new(
-        target.client("dynamodb").put_item,
-        TableName=target.output("storage", "ArchiveTable"),
-        Item=row.item(),
-        ConditionExpression="attribute_not_exists(content)",
-    )
+        good = objects.get(row.key, True) and (not row.refused or _copy_object(source, target, refused))
+        copied += good and _is_new(
+            target.client("dynamodb").put_item,
+            TableName=target.output("storage", "ArchiveTable"),
+            Item=row.item(),
+            ConditionExpression="attribute_not_exists(content)",
+        )
+    return copied
 
 
 def _is_new(put: Callable[..., Any], **what: Any) -> bool:
@@ -164,51 +144,23 @@ def _is_new(put: Callable[..., Any], **what: Any) -> bool:
     return True
 
 
-class _Objects:
-    """Copies the archive's objects, each once: a day's hours are in one. None of the target's is replaced."""
+def _copy_object(source: Cloud, target: Cloud, key: str, sha256: str | None = None) -> bool:
+    """Copy an object as it is, unless an interrupted move has; False if the target has another one."""
+    try:
+        content = bytes(_object(source, key))
+    except ClientError as error:
+        raise StationError(f"{key} cannot be read: {error.response['Error']['Code']}") from error
+    if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
+        raise StationError(f"{key} is not the object that was archived: run `iort archive verify`")
+    what: Any = {"Bucket": target.output("storage", "FilesBucket"), "Key": key}
+    return _is_new(target.client("s3").put_object, **what, Body=content, IfNoneMatch="*") or (
+        _object(target, key) == content
+    )
 
-    def __init__(self, source: Cloud, target: Cloud) -> None:
-        self._from, self._to = source.client("s3"), target.client("s3")
-        self._source, self._target = (one.output("storage", "FilesBucket") for one in (source, target))
-        self._copied: dict[str, bool] = {}
-        self._day: tuple[str, ArchiveFile] | None = None
 
-    def copy(self, key: str, sha256: str | None = None) -> bool:
-        """Copy an object as it is; returns False if the target has another one."""
-        if key not in self._copied:
-            self._copied[key] = self._put(key, self._read(key, sha256))
-        return self._copied[key]
-
-    def copy_hour(self, row: archive.ArchivedHour) -> archive.ArchivedHour | None:
-        """Copy an hour of a day's object into an object of its own, as before the day was joined.
-
-        Returns its row; None if the target has such an object already, and is about to point to it.
-        """
-        topic, hour = parse_topic(row.topic), archive.parse_hour(row.hour)
-        if self._day is None or self._day[0] != row.key:
-            self._day = row.key, ArchiveFile(self._read(row.key, row.sha256))
-        into = io.BytesIO()
-        write_day({hour: self._day[1]}, into, describe=described(topic.name))
-        content, key = into.getvalue(), archive.hour_key(topic, hour)
-        if not self._put(key, content):
-            return None
-        return replace(row, key=key, sha256=hashlib.sha256(content).hexdigest(), size_bytes=len(content))
-
-    def _put(self, key: str, content: bytes) -> bool:
-        """Write an object, unless an interrupted move has; returns False if the target has another one."""
-        what: Any = {"Bucket": self._target, "Key": key}
-        if _is_new(self._to.put_object, **what, Body=content, IfNoneMatch="*"):
-            return True
-        return bool(self._to.get_object(**what)["Body"].read() == content)
-
-    def _read(self, key: str, sha256: str | None) -> bytes:
-        try:
-            content = bytes(self._from.get_object(Bucket=self._source, Key=key)["Body"].read())
-        except ClientError as error:
-            raise StationError(f"{key} cannot be read: {error.response['Error']['Code']}") from error
-        if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
-            raise StationError(f"{key} is not the object that was archived: run `iort archive verify`")
-        return content
+def _object(cloud: Cloud, key: str) -> bytes:
+    bucket = cloud.output("storage", "FilesBucket")
+    return cloud.client("s3").get_object(Bucket=bucket, Key=key)["Body"].read()
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,7 @@ class _Moving:
         from iort_station.migration import recordings  # noqa: PLC0415 - as above
 
         source, target, topic = self._source, self._target, topic_of(self._source, robot, stream)
-        batches, hours = 0, recordings.Hours(0, 0)
+        batches = hours = 0
         with errors.status(f"{robot} {stream}") as status:
             read = _Reading(status.update, f"{robot} {stream}")
             if self._units is not None:
@@ -150,15 +150,12 @@ class _Moving:
                 for copy in (recordings.copy_batches, recordings.merge_hours):
                     batches += copy(source, target, topic, units_per_s=self._units, progress=read.tell)
             found = recordings.compare(source, target, robot, stream, read.tell)
-        if not found.batches and not hours.left:
+        if not found.batches:
             return
-        problem = found.problem
-        if hours.left:
-            problem += f"; {hours.left:,} hours are left, which the target is writing: move again later"
-        told = _as_json(robot, stream, found, problem.removeprefix("; "))
-        self.streams.append({**told, "copied_batches": batches, "copied_hours": hours.copied})
-        if problem:
-            self.problems.append(f"{robot} {stream}: {told['problem']}")
+        told = _as_json(robot, stream, found)
+        self.streams.append({**told, "copied_batches": batches, "copied_hours": hours})
+        if found.problem:
+            self.problems.append(f"{robot} {stream}: {found.problem}")
         if not self._quiet:
             _show(self.streams[-1])
 
@@ -213,7 +210,7 @@ def _target(source: Cloud, to: str, profile: str | None, region: str | None) -> 
     return CloudOptions(source.namespace, None, None, local=True, embedded=path).cloud()
 
 
-def _as_json(robot: str, stream: str, found: Compared, problem: str) -> dict[str, Any]:
+def _as_json(robot: str, stream: str, found: Compared) -> dict[str, Any]:
     return {
         "robot": robot,
         "stream": stream,
@@ -222,7 +219,7 @@ def _as_json(robot: str, stream: str, found: Compared, problem: str) -> dict[str
         "missing": found.audit.missing,
         "content": found.content,
         "more": found.more,
-        "problem": problem,
+        "problem": found.problem,
     }
 
 

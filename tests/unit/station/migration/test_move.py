@@ -15,9 +15,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from iort_analysis.archive.hours import HourFile
-from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.writing import described, write_day
-from iort_analysis.samples.blocks import join, values
 from iort_contract.archive import ArchivedHour, archived_hour, parse_hour
 from iort_contract.dynamodb import TableError
 from iort_contract.findings_table import FindingsTable
@@ -85,16 +83,6 @@ class Account:
             raise ClientError({"Error": {"Code": "ConditionalCheckFailedException"}}, ConditionExpression)
         self.rows.append(archived_hour(Item))
 
-    def speeds(self) -> dict[str, list[Any]]:
-        """What the manifest leads to, by hour."""
-        found = {}
-        for row in self.rows:
-            file = ArchiveFile(self.content[row.key])
-            assert hashlib.sha256(self.content[row.key]).hexdigest() == row.sha256
-            parts = list(file.pages(parse_hour(row.hour)))
-            found[row.hour[-2:]] = values(join([part.block for part in parts]).columns["speed"])
-        return found
-
 
 @pytest.fixture(autouse=True)
 def accounts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,23 +105,22 @@ def test_two_profiles_of_one_account_are_one_deployment(monkeypatch: pytest.Monk
     plan.check(here, replace(lab, region="us-east-1"))
 
 
-def test_a_day_is_merged_into_one_of_the_targets_own() -> None:
+def test_what_the_target_has_archived_is_not_replaced() -> None:
     source = Account("1", "07", "08")
-    new, other = Account("2"), Account("2", "08", "09")
-    assert recordings.copy_hours(source, new, TOPIC) == (2, 0)
+    new = Account("2")
+    assert [recordings.copy_hours(source, new, TOPIC) for _ in range(2)] == [2, 0]
     assert (new.content, new.rows) == (source.content, source.rows)
-    own = other.content[DAY]
-    assert recordings.copy_hours(source, other, TOPIC) == (1, 0)
-    assert other.content[DAY] == own
-    assert other.speeds() == {"08": [8.0] * 3, "09": [9.0] * 3, "07": [7.0] * 3}
-    assert recordings.copy_hours(source, other, TOPIC) == (0, 0)
-    # Killed before the row was written; then the target's archive is about to write the same hour.
-    hour = other.rows.pop()
-    assert recordings.copy_hours(source, other, TOPIC) == (1, 0)
-    assert other.rows.pop() == hour
-    other.content[hour.key] = b"being written"
-    assert recordings.copy_hours(source, other, TOPIC) == (0, 1)
-    assert other.content[hour.key] == b"being written"
+    # Killed before the row was written.
+    new.rows.pop()
+    assert recordings.copy_hours(source, new, TOPIC) == 1
+    # A day of its own, with and without the rows that point to it; and a row that comes between.
+    for other in (Account("2", "08", "09"), Account("2")):
+        other.content[DAY], rows = day("08", "09"), list(other.rows)
+        assert recordings.copy_hours(source, other, TOPIC) == 0
+        assert (other.content[DAY], other.rows) == (day("08", "09"), rows)
+    late = Account("2")
+    late.meanwhile = [replace(source.rows[0], content="own")]
+    assert recordings.copy_hours(source, late, TOPIC) == 1
 
 
 def test_an_hour_that_both_have_is_merged_from_the_sources_archive(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,33 +159,15 @@ def test_an_hour_that_both_have_is_merged_from_the_sources_archive(monkeypatch: 
     assert copied == {name: value for name, value in items[0].items() if name != "expires_s"}
     assert expires_s > time.time() + 29 * 86_400
     table.clear()
+    # The target has this day in another object, without this hour.
+    rows["target"].clear()
+    assert recordings.merge_hours(*sides, TOPIC) == 2
+    rows["target"] = [replace(row, content="target")]
+    table.clear()
     # The source's table has all of it, which is copied from there; or the hours are the same.
     for same in ({"first_expires_s": int(time.time()) + 10 * 86_400}, {"content": "target"}):
         rows["source"] = [replace(row, **same)]
         assert recordings.merge_hours(*sides, TOPIC) == 0
-
-
-def test_what_the_targets_archive_writes_meanwhile_is_not_replaced() -> None:
-    source = Account("1", "07")
-    # It has joined a day, or written an hour, and no row points to it yet.
-    joining = Account("2")
-    joining.content[DAY] = day("09")
-    assert recordings.copy_hours(source, joining, TOPIC) == (1, 0)
-    assert joining.content[DAY] == day("09")
-    assert joining.speeds() == {"07": [7.0] * 3}
-    hour = Account("1")
-    key = DAY.replace("day.", "07.")
-    hour.content[key] = day("07")
-    hour.rows = [replace(source.rows[0], key=key)]
-    writing = Account("2")
-    writing.content[key] = b"being written"
-    assert recordings.copy_hours(hour, writing, TOPIC) == (0, 1)
-    assert (writing.content[key], writing.rows) == (b"being written", [])
-    # The row comes between.
-    late = Account("2")
-    late.meanwhile = [own := replace(source.rows[0], content="own")]
-    assert recordings.copy_hours(source, late, TOPIC) == (0, 1)
-    assert late.rows == [own]
 
 
 def test_what_the_target_has_analysed_again_is_not_replaced() -> None:
