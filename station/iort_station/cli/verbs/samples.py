@@ -13,7 +13,8 @@ import typer
 from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
 from iort_contract.catalog.vesc import NO_SENSOR_DEGC
 from iort_station.cli import options
-from iort_station.cli.console import Console, reading, tell
+from iort_station.cli.console import out as out_console
+from iort_station.cli.console import reading, tell
 from iort_station.cli.options import (
     AsJson,
     Every,
@@ -158,18 +159,13 @@ def _write(result: Result, form: Format, file: TextIO, *, raw: bool) -> None:
         tabular.to_csv(result, file, raw=raw)
     elif form == "jsonl":
         tabular.to_json_lines(result, file)
-    elif file.isatty():
-        console = Console(file=file)
-        shown = tables.terminal(result, console.width)
-        console.print(shown.table)
+    else:
+        shown = tables.write(result, file, out_console.width if file.isatty() else None)
         if shown.rows < len(result):
             options.say(f"{shown.rows} of {len(result):,} shown; a pipe or --out FILE.csv gets every one")
         if shown.left_out:
-            options.say(
-                f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --out FILE.csv"
-            )
-    else:
-        tables.plain(result, file)
+            left_out = ", ".join(shown.left_out)
+            options.say(f"no room for {left_out}: choose with --fields, or use --out FILE.csv")
 
 
 # `iort export`: the data as files that other tools open.
