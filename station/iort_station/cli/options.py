@@ -10,9 +10,10 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from dataclasses import fields as dataclass_fields
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
@@ -28,101 +29,86 @@ from iort_station.output import cache, one_line, whole
 from iort_station.times import duration_us, has_zone, is_clock, iso_s, time_us
 from iort_station.upkeep.snapshot import VERSION
 
+if TYPE_CHECKING:
+    from iort_contract.messages.page import Archived
+
 # What TAB offers: the names of robots, streams, fields and files.
 #
 # The shell waits for TAB, and a cloud takes a second to answer. So names are kept in a file, in the user's
 # cache. A process in the background asks the cloud, and writes the file for the next TAB. Only the first TAB
 # waits for it. TAB prints no error: an unreachable cloud offers nothing.
 
-if TYPE_CHECKING:
-    from iort_station.cloud import Cloud
-
 # How long names are offered before the cloud is asked again, and how long the first TAB waits.
 _FRESH_S, _PATIENCE_S = 30.0, 3.0
 _NEWEST_FILES = 200
 # Set in the process in the background.
 _ASKS = "IORT_COMPLETION_ASKS"
-Ask = Callable[["Cloud"], list[str]]
+Offer = Callable[[typer.Context, str], list[str]]
 
 
-def robots(ctx: typer.Context, incomplete: str) -> list[str]:
-    """The registered robots."""
+def _offer(ask: Callable[[Cloud, str, str], Iterable[str]], *, several: bool = False) -> Offer:
+    """What TAB offers: names that ``ask`` gets of the cloud, for the robot and the stream that are named
+    before. With ``several``, more may follow after a comma."""
 
-    def ask(cloud: Cloud) -> list[str]:
-        from iort_station.fleet import registry  # noqa: PLC0415 - only the background asks
+    def offered(ctx: typer.Context, incomplete: str) -> list[str]:
+        robot, stream = str(ctx.params.get("robot") or ctx.params.get("name")), str(ctx.params.get("stream"))
+        names = _names(ctx, lambda cloud: list(ask(cloud, robot, stream)), ask.__name__, robot, stream)
+        before, comma, begun = incomplete.rpartition(",") if several else ("", "", incomplete)
+        taken = before.split(",")
+        return [f"{before}{comma}{name}" for name in names if name.startswith(begun) and name not in taken]
 
-        return sorted(str(row["robot"]) for row in registry.listed(cloud))
-
-    return _matching(_names(ctx, ask, "robots"), incomplete)
-
-
-def streams(ctx: typer.Context, incomplete: str) -> list[str]:
-    """The streams of the robot that is named before."""
-    robot = _robot(ctx)
-
-    def ask(cloud: Cloud) -> list[str]:
-        from iort_station.data import inventory  # noqa: PLC0415 - as above
-
-        return inventory.streams_of(cloud, robot)
-
-    return _matching(_names(ctx, ask, "streams", robot), incomplete)
+    return offered
 
 
-def fields(ctx: typer.Context, incomplete: str) -> list[str]:
-    """The fields of the stream that is named before, and the derived ones; after a comma another one."""
-    robot, stream = _robot(ctx), str(ctx.params.get("stream"))
-
-    def ask(cloud: Cloud) -> list[str]:
-        from iort_station.data import inventory  # noqa: PLC0415 - as above
-
-        return sorted({*inventory.newest_block(cloud, robot, stream).columns, *DERIVED})
-
-    before, comma, begun = incomplete.rpartition(",")
-    known = set(_names(ctx, ask, "fields", robot, stream)) - set(before.split(","))
-    return [f"{before}{comma}{name}" for name in _matching(sorted(known), begun)]
+# Only the background asks, so only it imports what this needs.
 
 
-def files(ctx: typer.Context, incomplete: str) -> list[str]:
-    """The newest files of the robot that is named before."""
-    robot = _robot(ctx)
+def _robots(cloud: Cloud, _robot: str, _stream: str) -> Iterable[str]:
+    from iort_station.fleet import registry  # noqa: PLC0415 - see above
 
-    def ask(cloud: Cloud) -> list[str]:
-        from iort_station.fleet import files as stored  # noqa: PLC0415 - as above
-
-        found = dict.fromkeys(one.name for one in stored.listed(cloud, robot))
-        return list(found)[-_NEWEST_FILES:]
-
-    return _matching(_names(ctx, ask, "files", robot), incomplete)
+    return sorted(str(row["robot"]) for row in registry.listed(cloud))
 
 
-def _robot(ctx: typer.Context) -> str:
-    return str(ctx.params.get("robot") or ctx.params.get("name"))
+def _streams(cloud: Cloud, robot: str, _stream: str) -> Iterable[str]:
+    from iort_station.data import inventory  # noqa: PLC0415 - see above
+
+    return inventory.streams_of(cloud, robot)
 
 
-def _matching(names: list[str], begun: str) -> list[str]:
-    return [name for name in names if name.startswith(begun)]
+def _fields(cloud: Cloud, robot: str, stream: str) -> Iterable[str]:
+    from iort_station.data import inventory  # noqa: PLC0415 - see above
+
+    return sorted({*inventory.newest_block(cloud, robot, stream).columns, *DERIVED})
 
 
-def _names(ctx: typer.Context, ask: Ask, *key: str) -> list[str]:
+def _files(cloud: Cloud, robot: str, _stream: str) -> Iterable[str]:
+    from iort_station.fleet import files  # noqa: PLC0415 - see above
+
+    return list(dict.fromkeys(file.name for file in files.listed(cloud, robot)))[-_NEWEST_FILES:]
+
+
+robots, streams, files = _offer(_robots), _offer(_streams), _offer(_files)
+fields = _offer(_fields, several=True)
+
+
+def _names(ctx: typer.Context, ask: Callable[[Cloud], list[str]], *key: str) -> list[str]:
     """The names that are kept under ``key``; older ones are asked for in the background."""
     with suppress(Exception):
         given = ctx.find_root().params
-        options = CloudOptions(
-            *(given[name] for name in ("namespace", "profile", "region", "local", "embedded"))
-        )
+        options = CloudOptions(**{each.name: given[each.name] for each in dataclass_fields(CloudOptions)})
         path = _kept_at(options, *key)
         if _ASKS in os.environ:
             _keep(path, ask(options.cloud()))
             return []
-        found = _kept(path)
+        names = _kept(path)
         if not path.exists() or not 0 <= time.time() - path.stat().st_mtime < _FRESH_S:
             # Also a cloud that does not answer is asked only so often.
-            _keep(path, found)
+            _keep(path, names)
             asking = _ask_in_background()
-            if not found:
+            if not names:
                 asking.wait(_PATIENCE_S)
                 return _kept(path)
-        return found
+        return names
     return []
 
 
@@ -158,9 +144,6 @@ def _kept_at(options: CloudOptions, *key: str) -> Path:
 
 
 # Words to the operator: on standard error, where they do not get into a pipe, and in the help.
-
-if TYPE_CHECKING:
-    from iort_contract.messages.page import Archived
 
 
 def say(*lines: str) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import csv
 import io
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -16,7 +14,6 @@ from rich.table import Table
 from rich.text import Text
 from typer.testing import CliRunner
 
-import iort_station
 from iort_contract.messages.batch import Batch
 from iort_station.cli.console import Console, Lines
 from iort_station.cli.main import app
@@ -180,22 +177,3 @@ def test_markup_and_emoji_codes_are_printed_literally():
     console.print(table)
     for text in ("[/bold] :car:", "[link=https://example.org]here[/link]", "[/]"):
         assert text in file.getvalue()
-
-
-def test_every_command_prints_by_the_console():
-    """The other prints are listed: the version, a line of JSON, and the escaped error."""
-    folder, printing = Path(iort_station.__file__).parent, set()
-    for path in folder.rglob("*.py"):
-        name, tree = str(path.relative_to(folder)), ast.parse(path.read_text())
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module == "rich.console":
-                assert "Console" not in {alias.name for alias in node.names}, name
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in {"print", "typer.echo", "click.echo"}:
-                printing.add((name, ast.unparse(node.args[0])))
-    assert printing == {
-        ("cli/main.py", "f\"iort {version('iort-station')}\""),
-        ("cli/options.py", "'iort: ' + '\\n'.join(map(one_line, lines))"),
-        # Made visible a cell at a time.
-        ("cli/tables.py", "stamp.ljust(len(_TIME_WIDE))"),
-        ("cli/verbs/live.py", "json.dumps({**line, 'sample': live.sample})"),
-    }
