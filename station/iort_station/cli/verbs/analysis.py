@@ -196,29 +196,29 @@ def findings_(
         registry.get(cloud, robot)
 
 
-def _show(page: str, one: Finding) -> None:
-    kind = KINDS.get(one.kind)
-    out.print(
-        Text.assemble(
-            f"{iso_s(one.from_us)}  {one.drive.robot}  ",
-            (f"{one.severity}: {one.text}", _STYLES.get(one.severity, "")),
-        ),
-        soft_wrap=True,
-    )
-    rows = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=True)
-    rows.add_column(width=8)
-    rows.add_column(overflow="fold")
-    if one.effect is not None:
-        rows.add_row("effect", _interval(one.effect))
-    if one.baseline is not None:
-        rows.add_row("before", _interval(one.baseline))
-    if one.q is not None:
-        rows.add_row("false", f"at most {one.q:.2g} of such findings")
-    if kind is not None:
-        rows.add_row("to do", kind.action)
+def _show(page: str, finding: Finding) -> None:
+    what = (f"{finding.severity}: {finding.text}", _STYLES.get(finding.severity, ""))
+    out.print(Text.assemble(f"{iso_s(finding.from_us)}  {finding.drive.robot}  ", what), soft_wrap=True)
+    rows = _rows()
+    if finding.effect is not None:
+        rows.add_row("effect", _interval(finding.effect))
+    if finding.baseline is not None:
+        rows.add_row("before", _interval(finding.baseline))
+    if finding.q is not None:
+        rows.add_row("false", f"at most {finding.q:.2g} of such findings")
+    if finding.kind in KINDS:
+        rows.add_row("to do", KINDS[finding.kind].action)
     out.print(rows)
     # In one piece, to be clicked or copied.
-    out.print(Text(f" evidence {history_link(page, one)}"), soft_wrap=True)
+    out.print(Text(f" evidence {history_link(page, finding)}"), soft_wrap=True)
+
+
+def _rows() -> Table:
+    """Rows of a name and a text, which may take several lines."""
+    rows = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=True)
+    rows.add_column(min_width=8)
+    rows.add_column(overflow="fold")
+    return rows
 
 
 def _as_json(page: str, finding: Finding) -> dict[str, Any]:
@@ -243,18 +243,16 @@ def _interval(estimate: Estimate) -> str:
     return f"{value:.4g} {unit} ({low:.4g} to {high:.4g})"
 
 
-def _show_drive(one: AnalysedDrive) -> None:
-    lasted_s = (one.end_us - one.drive.start_us) / 1e6
-    out.print(f"{iso_s(one.drive.start_us)}  {one.drive.robot}  {lasted_s:,.0f} s, {one.samples:,} samples")
-    rows = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=True)
-    rows.add_column()
-    rows.add_column(overflow="fold")
-    for name, estimate in one.estimates.items():
+def _show_drive(analysed: AnalysedDrive) -> None:
+    drive, lasted_s = analysed.drive, (analysed.end_us - analysed.drive.start_us) / 1e6
+    out.print(f"{iso_s(drive.start_us)}  {drive.robot}  {lasted_s:,.0f} s, {analysed.samples:,} samples")
+    rows = _rows()
+    for name, estimate in analysed.estimates.items():
         rows.add_row(name, _interval(estimate))
-    for kind, samples in one.repairs.items():
+    for kind, samples in analysed.repairs.items():
         rows.add_row(f"repaired: {kind}", f"{samples:,} samples")
     names_of: dict[str, list[str]] = {}
-    for name, reason in one.missing.items():
+    for name, reason in analysed.missing.items():
         names_of.setdefault(reason, []).append(name)
     for reason, names in names_of.items():
         rows.add_row("missing", f"{', '.join(names)}: {reason}", style="yellow")

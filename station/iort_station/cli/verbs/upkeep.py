@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,8 +13,8 @@ from rich.progress import MofNCompleteColumn
 from rich.text import Text
 
 from iort_contract.topics import parse_topic
-from iort_station.cli import console, options
-from iort_station.cli.console import bar, out, print_json, tell
+from iort_station.cli import options
+from iort_station.cli.console import bar, listing, out, print_json, tell
 from iort_station.cli.options import AsJson, DryRun, Force, State, argument, examples, option, say
 from iort_station.data.recorded import archive_of
 from iort_station.errors import StationError
@@ -49,6 +50,7 @@ def backup_(
 # `iort doctor`: what is wrong with the cloud, or will be, and what to do.
 
 if TYPE_CHECKING:
+    from iort_contract.archive import ArchivedHour
     from iort_station.cloud import Cloud
     from iort_station.upkeep.deployment import Finding
 
@@ -69,21 +71,15 @@ def doctor_(
     Of the cloud of `make up`: processes, servers, disk, memory, certificates, clock, backup. Of every cloud:
     how far summaries are behind, the load, alarms. Exit status 0 if nothing fails, 1 otherwise.
     """
-    found = []
-    for finding in _findings(context, state, deep=deep):
-        found.append(finding)
+    first, cloud = _looked_at(context, state)
+    findings = []
+    for finding in chain(first, _deep(cloud) if deep else ()):
+        findings.append(finding)
         if not as_json:
             _print(finding)
     if as_json:
-        print_json([finding._asdict() for finding in found])
-    raise typer.Exit(1 if any(finding.level == "fail" for finding in found) else 0)
-
-
-def _findings(context: typer.Context, state: Path | None, *, deep: bool) -> Iterator[Finding]:
-    findings, cloud = _looked_at(context, state)
-    yield from findings
-    if deep:
-        yield from _deep(cloud)
+        print_json([finding._asdict() for finding in findings])
+    raise typer.Exit(1 if any(finding.level == "fail" for finding in findings) else 0)
 
 
 def _looked_at(context: typer.Context, state: Path | None) -> tuple[Iterator[Finding], Callable[[], Cloud]]:
@@ -204,36 +200,34 @@ def show(
 ) -> None:
     """List the streams in the archive: hours, samples, bytes."""
     cloud = context.obj.cloud()
-    streams: list[dict[str, Any]] = []
-    for topic in archive.topics(cloud, robot, stream):
-        rows = list(archive_of(cloud, topic).rows())
-        if not rows:
-            continue
-        name = parse_topic(topic)
+    topics = archive.topics(cloud, robot, stream)
+    rows = (_archived(topic, hours) for topic in topics if (hours := list(archive_of(cloud, topic).rows())))
+    listing(rows, dict, _show_archived, as_json=as_json, none=_EMPTY)
+
+
+def _archived(topic: str, hours: list[ArchivedHour]) -> dict[str, Any]:
+    name = parse_topic(topic)
+    counts = {
+        count: sum(getattr(hour, count) for hour in hours) for count in ("batches", "samples", "refused")
+    }
+    return {
+        "robot": name.robot,
+        "stream": name.name,
+        "first": hours[0].hour,
+        "last": hours[-1].hour,
+        "hours": len(hours),
+        **counts,
         # The hours of a day are one object.
-        size = sum({row.key: row.size_bytes for row in rows}.values())
-        facts = {
-            "robot": name.robot,
-            "stream": name.name,
-            "first": rows[0].hour,
-            "last": rows[-1].hour,
-            "hours": len(rows),
-            "batches": sum(row.batches for row in rows),
-            "samples": sum(row.samples for row in rows),
-            "refused": sum(row.refused for row in rows),
-            "bytes": size,
-        }
-        streams.append(facts)
-        if not as_json:
-            text = (
-                f"{name.robot} {name.name}: {len(rows):,} hours from {rows[0].hour} to {rows[-1].hour}, "
-                f"{facts['samples']:,} samples, {size:,} bytes"
-            )
-            console.out.print(text, soft_wrap=True)
-    if as_json:
-        console.print_json(streams)
-    elif not streams:
-        say(_EMPTY)
+        "bytes": sum({hour.key: hour.size_bytes for hour in hours}.values()),
+    }
+
+
+def _show_archived(row: dict[str, Any]) -> None:
+    out.print(
+        f"{row['robot']} {row['stream']}: {row['hours']:,} hours from {row['first']} to {row['last']}, "
+        f"{row['samples']:,} samples, {row['bytes']:,} bytes",
+        soft_wrap=True,
+    )
 
 
 @archive_commands.command("run", epilog=examples("archive run", "archive run car7 vesc"))
@@ -252,13 +246,13 @@ def run(
         with bar("archiving", hours, MofNCompleteColumn()) as progress:
             done = 0
 
-            def tell(left: int) -> None:
+            def step(left: int) -> None:
                 nonlocal done
                 progress(max(0, hours - left) - done)
                 done = max(0, hours - left)
 
-            archive.wait(cloud, tell)
-    console.tell({"hours": hours}, f"{hours} hours done", as_json=as_json)
+            archive.wait(cloud, step)
+    tell({"hours": hours}, f"{hours} hours done", as_json=as_json)
 
 
 @archive_commands.command("verify", epilog=examples("archive verify", "archive verify car7 vesc"))
@@ -270,28 +264,32 @@ def verify(
     Fails if anything is missing. `iort doctor --deep` looks at every stream, and at files.
     """
     cloud = context.obj.cloud()
-    wrong, streams = 0, []
-    for topic in archive.topics(cloud, robot, stream):
-        name, found = parse_topic(topic), archive.verify(cloud, topic)
-        problems = {hour: f"{count} batches are not archived" for hour, count in found.lacking.items()}
-        problems |= found.damaged
-        wrong += len(problems)
-        if not found.hours and not problems:
-            continue
-        facts = {"hours": found.hours, "samples": found.samples, "problems": problems}
-        facts |= {"refused": found.refused.count, "named": found.refused.named}
-        streams.append({"robot": name.robot, "stream": name.name, **facts})
-        lines = [f"{name.robot} {name.name}: {found.hours:,} hours, {found.samples:,} samples"]
-        lines += [f"    {hour}: {problem}" for hour, problem in problems.items()]
-        lines += [f"    cannot be decoded: {line}" for line in found.refused.named]
-        if not as_json:
-            for line in lines:
-                console.out.print(line, soft_wrap=True)
-    if as_json:
-        console.print_json(streams)
-    elif not streams:
-        say(_EMPTY)
-    if wrong:
+    topics = archive.topics(cloud, robot, stream)
+    rows = [row for topic in topics if (row := _verified(cloud, topic))["hours"] or row["problems"]]
+    listing(rows, dict, _show_verified, as_json=as_json, none=_EMPTY)
+    if wrong := sum(len(row["problems"]) for row in rows):
         raise StationError(
             f"{wrong} hours are not as they should be: `iort archive run`, then look at `iort alarms`"
         )
+
+
+def _verified(cloud: Cloud, topic: str) -> dict[str, Any]:
+    name, found = parse_topic(topic), archive.verify(cloud, topic)
+    problems = {hour: f"{count} batches are not archived" for hour, count in found.lacking.items()}
+    return {
+        "robot": name.robot,
+        "stream": name.name,
+        "hours": found.hours,
+        "samples": found.samples,
+        "problems": problems | found.damaged,
+        "refused": found.refused.count,
+        "named": found.refused.named,
+    }
+
+
+def _show_verified(row: dict[str, Any]) -> None:
+    lines = [f"{row['robot']} {row['stream']}: {row['hours']:,} hours, {row['samples']:,} samples"]
+    lines += [f"    {hour}: {problem}" for hour, problem in row["problems"].items()]
+    lines += [f"    cannot be decoded: {line}" for line in row["named"]]
+    for line in lines:
+        out.print(line, soft_wrap=True)
