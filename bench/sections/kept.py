@@ -29,8 +29,9 @@ from bench.sections import Declared, Option
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.data import inventory
+from iort_station.data.accounts import accounts
 from iort_station.fleet import robots
-from iort_station.operations import accounts, audit
+from iort_station.operations import audit
 from local.figures import Spread
 from local.processes import Child
 from testkit import ROOT, machine
@@ -160,9 +161,9 @@ class Counted:
 
 def count(cloud: Cloud, robot: str) -> Counted:
     """Audit every stream of a robot, from its first batch on."""
-    account, now_us = accounts.accounts(cloud, robot), time.time_ns() // 1000
+    account, now_us = accounts(cloud, robot), time.time_ns() // 1000
     audits = [
-        accounts.held_against(
+        audit.held_against(
             audit.audit(name, audit.headers(cloud, robot, name), from_start=True), account, now_us
         )
         for name in inventory.known(cloud, robot)

@@ -254,6 +254,14 @@ def agreed(question: str, *, yes: bool) -> None:
     typer.confirm(question, abort=True, err=True)
 
 
+def assigned(text: str, example: str) -> tuple[str, str]:
+    """The name and the value of NAME=VALUE; raises `UsageError`."""
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise UsageError(f"must be NAME=VALUE, for example {example}, got {text}")
+    return name, value
+
+
 def names(fields: str | None) -> list[str] | None:
     """The names in a comma-separated list; None for an empty one."""
     return [name.strip() for name in (fields or "").split(",") if name.strip()] or None

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from iort_analysis.samples.blocks import Block, values
 from iort_station.data.queries import CLIENT, LAMBDA, Result, query, samples
-from iort_station.data.recorded import Reading, Selection, select
+from iort_station.data.recorded import Selection, select
 
 __all__ = [
     "CLIENT",
     "LAMBDA",
     "Block",
-    "Reading",
     "Result",
     "Selection",
     "query",

@@ -165,7 +165,7 @@ def _make(
 ) -> int:
     """Write messages made of the samples that are not ROS messages, and return their number."""
     robot, stream = selection.robot, selection.stream
-    blocks = data.samples(cloud, selection, data.Reading(), messages=False)
+    blocks = data.samples(cloud, selection, messages=False)
     # If topics share a stream, nobody can tell which one a selection of fields belongs to.
     shared = len({kind.topic for kind in known.values()}) > 1
     kind = None if shared else next(iter(reversed(list(known.values()))), None)

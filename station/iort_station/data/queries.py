@@ -15,7 +15,8 @@ from iort_analysis.archive.stored import AUTO, Origin, PageProgress, Source
 from iort_analysis.samples.batches import in_order
 from iort_analysis.samples.blocks import Block, Column, join, resample
 from iort_contract.catalog.derived import DERIVED
-from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
+from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS
+from iort_contract.catalog.vesc import absent as is_absent
 from iort_contract.dynamodb import with_samples_between
 from iort_contract.ros1.message import MessageType
 from iort_contract.tables import STATS
@@ -23,7 +24,7 @@ from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.conditions import derive, holds
 from iort_station.data.inventory import unit
-from iort_station.data.recorded import Reading, Selection, select
+from iort_station.data.recorded import Recorded, Selection, select
 from iort_station.data.remote import by_function, check_in_table
 from iort_station.data.seconds import in_column_order, seconds
 from iort_station.errors import StationError
@@ -107,14 +108,16 @@ def query(
     """
     selection = select(robot, stream, start, end, fields=fields, where=where)
     every_us = duration_us(every) if every is not None else None
-    reading = Reading(source, scan, progress, absent=Counter())
+    recorded, absent = Recorded(cloud, robot, stream, source=source), Counter[str]()
     if on == LAMBDA:
         if summary:
             raise StationError("the query function reads samples; query the summary without --on lambda")
-        check_in_table(cloud, selection, reading)
-        blocks = by_function(cloud, selection, reading)
+        check_in_table(selection, recorded)
+        blocks = by_function(cloud, selection, recorded.refused, absent, scan=scan, progress=progress)
+    elif summary:
+        blocks = seconds(cloud, selection, recorded, scan=scan, progress=progress)
     else:
-        blocks = (seconds if summary else samples)(cloud, selection, reading)
+        blocks = samples(cloud, selection, recorded, absent=absent, scan=scan, progress=progress)
     ros2 = False
 
     def watched() -> Iterator[Block]:
@@ -132,34 +135,41 @@ def query(
     block = join(list(watched())) if every_us is None else resample(watched(), every_us)
     if summary and fields is None:
         block = in_column_order(block)
-    if not len(block.times_us) and not reading.refused.count:
+    if not len(block.times_us) and not recorded.refused.count:
         inventory.check_there(cloud, robot, stream)
     return Result(
         robot,
         stream,
         block.times_us,
         block.columns,
-        reading.refused.count,
-        reading.refused.reason,
+        recorded.refused.count,
+        recorded.refused.reason,
         ros2,
-        reading.absent or {},
-        reading.origin.within(selection.start_us, selection.end_us),
+        absent,
+        recorded.origin.within(selection.start_us, selection.end_us),
         cache(partial(inventory.kind_of, cloud, selection)),
     )
 
 
 def samples(
-    cloud: Cloud, selection: Selection, reading: Reading, *, messages: bool = True
+    cloud: Cloud,
+    selection: Selection,
+    recorded: Recorded | None = None,
+    *,
+    absent: Counter[str] | None = None,
+    messages: bool = True,
+    scan: bool = False,
+    progress: PageProgress | None = None,
 ) -> Iterator[Block]:
     """The selection's samples block by block, for ranges that do not fit in memory.
 
-    Without ``messages``, samples of ROS messages are skipped. Raises `StationError` at the end for a named
-    field that no sample has.
+    ``absent`` counts values by field that became null because their sensor is not fitted; without it they
+    stay as recorded. Without ``messages``, samples of ROS messages are skipped; ``scan`` reads by Scan.
+    Raises `StationError` at the end for a named field that no sample has.
     """
+    recorded = recorded or Recorded(cloud, selection.robot, selection.stream)
     keys = with_samples_between(selection.start_us, selection.end_us)
-    parts = reading.recorded(cloud, selection).parts(
-        keys, selection.wanted(), messages=messages, scan=reading.scan, progress=reading.progress
-    )
+    parts = recorded.parts(keys, selection.wanted(), messages=messages, scan=scan, progress=progress)
     named = selection.named()
     derived = named & DERIVED.keys()
     vehicle = registry.vehicle_of(cloud, selection.robot) if derived else None
@@ -167,7 +177,7 @@ def samples(
     some = False
     for whole in in_order(parts):
         block = _within(whole, selection)
-        block = block if reading.absent is None else _without_absent(block, reading.absent)
+        block = block if absent is None else _without_absent(block, absent)
         n = len(block.times_us)
         some = some or n > 0
         columns = dict(block.columns)
@@ -211,7 +221,7 @@ def _without_absent(block: Block, counts: Counter[str]) -> Block:
         if numbers:
             mask = column <= ABSENT_FROM[name]
         else:
-            mask = np.array([absent(name, value) for value in column.tolist()], dtype=np.bool_)
+            mask = np.array([is_absent(name, value) for value in column.tolist()], dtype=np.bool_)
         if mask.any():
             changed[name] = column.copy()
             changed[name][mask] = np.nan if numbers else None

@@ -6,12 +6,11 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from iort_analysis.archive.hours import Archive, Stores
-from iort_analysis.archive.stored import AUTO, Origin, PageProgress, Source, Stored
+from iort_analysis.archive.stored import AUTO, Origin, Source, Stored
 from iort_analysis.samples.batches import RefusedItems
 from iort_contract import dynamodb, expression
 from iort_contract.archive import ArchiveTable
@@ -133,30 +132,3 @@ def stores(cloud: Cloud) -> Stores:
     return Stores(
         telemetry_table(cloud), manifest, lambda: (cloud.client("s3"), cloud.output("storage", "FilesBucket"))
     )
-
-
-@dataclass
-class Reading:
-    """How a query reads, and what it learns. ``progress`` is called for each page, ``scan`` reads by Scan.
-
-    ``refused`` counts what cannot be read, ``origin`` what comes from the archive, and ``absent`` the values
-    by field that became null because their sensor is not fitted; with None they stay as recorded.
-    """
-
-    source: Source = AUTO
-    scan: bool = False
-    progress: PageProgress | None = None
-    refused: RefusedItems = field(default_factory=RefusedItems)
-    origin: Origin = field(default_factory=Origin)
-    absent: Counter[str] | None = None
-
-    def recorded(self, cloud: Cloud, selection: Selection) -> Recorded:
-        """The stream's batches, for this reading."""
-        return Recorded(
-            cloud,
-            selection.robot,
-            selection.stream,
-            source=self.source,
-            origin=self.origin,
-            refused=self.refused,
-        )

@@ -4,39 +4,46 @@ from __future__ import annotations
 
 import ssl
 import urllib.request
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from iort_analysis.archive.stored import TABLE, Origin
+from iort_analysis.archive.stored import Origin, PageProgress
+from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import Block, column_of, join, ordered
 from iort_contract.dynamodb import with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages import questions
 from iort_station.cloud import Cloud, invoke
 from iort_station.data import inventory
-from iort_station.data.recorded import Reading, Selection
+from iort_station.data.recorded import Recorded, Selection
 from iort_station.errors import StationError
 from iort_station.times import iso_s
 
 _DOWNLOAD_S = 60
 
 
-def check_in_table(cloud: Cloud, selection: Selection, reading: Reading) -> None:
+def check_in_table(selection: Selection, recorded: Recorded) -> None:
     """Raise `StationError` if the query function, which reads the table only, would leave something out."""
-    if reading.source == TABLE:
-        return
     keys = with_samples_between(selection.start_us, selection.end_us)
-    hours = reading.recorded(cloud, selection).archived(keys)
-    if archived := Origin(hours).within(selection.start_us, selection.end_us).told():
+    if archived := Origin(recorded.archived(keys)).within(selection.start_us, selection.end_us).told():
         raise StationError(
             f"the query function reads the table only, from which {archived['hours']:,} hours of this range "
             f"have expired, or soon will: leave out --on lambda, or start at {iso_s(archived['to_us'])}"
         )
 
 
-def by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Block]:
+def by_function(
+    cloud: Cloud,
+    selection: Selection,
+    refused: RefusedItems,
+    absent: Counter[str],
+    *,
+    scan: bool,
+    progress: PageProgress | None,
+) -> Iterator[Block]:
     """The selection's samples, from as many invocations of the query function as needed.
 
     Raises `StationError` if the function fails, and at the end for a field that no sample has.
@@ -48,7 +55,7 @@ def by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterato
         questions.LAST_US if selection.end_us is None else selection.end_us,
         selection.fields,
         selection.where,
-        reading.scan,
+        scan,
     )
     parts: list[Block] = []
     there: set[str] = set()
@@ -57,12 +64,11 @@ def by_function(cloud: Cloud, selection: Selection, reading: Reading) -> Iterato
         part = _unpacked(cloud, answer)
         parts.append(part)
         there |= set(answer.fields)
-        reading.refused.count += answer.refused
-        reading.refused.named += [answer.reason] if answer.reason else []
-        if reading.absent is not None:
-            reading.absent.update(answer.absent)
-        if reading.progress is not None and len(part.times_us):
-            reading.progress(answer.items, int(part.times_us[-1]))
+        refused.count += answer.refused
+        refused.named += [answer.reason] if answer.reason else []
+        absent.update(answer.absent)
+        if progress is not None and len(part.times_us):
+            progress(answer.items, int(part.times_us[-1]))
         if answer.token is None:
             break
         request = replace(request, token=answer.token)

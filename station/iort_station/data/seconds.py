@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, islice
 from typing import Any
 
-from iort_analysis.archive.stored import Pages, ahead, only
+from iort_analysis.archive.stored import PageProgress, Pages, ahead, only
 from iort_analysis.samples.batches import Item
 from iort_analysis.samples.blocks import Block, column_of, objects
 from iort_contract import dynamodb, expression, tables
@@ -18,7 +18,7 @@ from iort_contract.limits import MAX_BATCH_SPAN_US
 from iort_contract.statistics import reach, summarize_seconds
 from iort_station.cloud import Cloud
 from iort_station.data.conditions import holds
-from iort_station.data.recorded import Reading, Recorded, Selection, summary_table, topic_of
+from iort_station.data.recorded import Recorded, Selection, summary_table, topic_of
 from iort_station.errors import unknown
 from iort_station.fleet import registry
 
@@ -36,17 +36,24 @@ _COUNTS = (
 )
 
 
-def seconds(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Block]:
+def seconds(
+    cloud: Cloud,
+    selection: Selection,
+    recorded: Recorded,
+    *,
+    scan: bool = False,
+    progress: PageProgress | None = None,
+) -> Iterator[Block]:
     """The seconds that start in the selection's range, some at a time; times are their starts.
 
     Seconds expire with their batches. They are then computed from the archive. A field stands for its
     ``_min``, ``_mean``, ``_max`` and ``_last``. Raises `StationError` for a field that no second has.
     """
     there: dict[str, None] = {}
-    for whole in _blocks(cloud, selection, reading):
+    for whole in _blocks(cloud, selection, recorded, scan=scan):
         block = whole
-        if reading.progress is not None:
-            reading.progress(len(block.times_us), int(block.times_us[-1]))
+        if progress is not None:
+            progress(len(block.times_us), int(block.times_us[-1]))
         there |= dict.fromkeys(block.columns)
         if selection.condition is not None:
             block = block.take(holds(selection.condition, block.columns, len(block.times_us)))
@@ -65,10 +72,9 @@ def seconds(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Bl
         raise unknown(problem, missing, there, f"iort streams {selection.robot}")
 
 
-def _blocks(cloud: Cloud, selection: Selection, reading: Reading) -> Iterator[Block]:
+def _blocks(cloud: Cloud, selection: Selection, recorded: Recorded, *, scan: bool) -> Iterator[Block]:
     """The seconds as they are stored or computed, in order of time."""
-    recorded = reading.recorded(cloud, selection)
-    stored = stored_seconds(cloud, selection, scan=reading.scan) if recorded.reads_table else iter(())
+    stored = stored_seconds(cloud, selection, scan=scan) if recorded.reads_table else iter(())
     table = Pages(stored, _second)
     first, last = _range_s(selection)
     keys = dynamodb.with_samples_between(selection.start_us, selection.end_us)

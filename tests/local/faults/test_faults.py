@@ -20,8 +20,9 @@ import pytest
 
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import LIVE_MAX_AGE_MS
+from iort_station.data.accounts import accounts
 from iort_station.fleet import identity, robots
-from iort_station.operations import accounts, audit
+from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
 from testkit.waiting import GUARD_S, until
@@ -194,9 +195,9 @@ def test_a_claimed_robot_that_is_killed_in_an_outage_loses_only_its_open_batch(e
     restart = found.index(0, 1)
     assert found[:restart] == list(range(restart))
     assert restart >= closed
-    told = accounts.accounts(embedded.cloud, car.robot)
+    told = accounts(embedded.cloud, car.robot)
     headers = audit.headers(embedded.cloud, car.robot, "vesc")
-    vesc = accounts.held_against(audit.audit("vesc", headers), told, time.time_ns() // 1000)
+    vesc = audit.held_against(audit.audit("vesc", headers), told, time.time_ns() // 1000)
     assert (vesc.missing, len(vesc.runs)) == (0, 2)
     (short,) = [one for one in vesc.shortfalls if one.samples is None]
     assert short.cause == "were in open batches, at most one second: the run did not end properly"
@@ -314,7 +315,7 @@ def test_a_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage)
     runs = audit.audit("vesc", items, from_start=True).runs
     missing = [seq for run in runs for gap in run.missing for seq in range(gap.first, gap.last + 1)]
     assert missing == [seq for seq, _, _ in lost[:known]]
-    told = accounts.accounts(embedded.cloud, car.robot)[report["boot"]].not_recorded()["queue"]
+    told = accounts(embedded.cloud, car.robot)[report["boot"]].not_recorded()["queue"]
     assert told["damaged_files"] == 1
     assert told.get("dropped_samples", 0) == report["spool"]["dropped_samples"]
 

@@ -200,7 +200,7 @@ def test_a_sensor_that_is_not_fitted_is_null_and_counted(on, motor):
 def test_exported_messages_have_the_recorded_values():
     columns = {"temp_motor": COLD}
     cloud = Cloud(table(Batch("0badcafe", 0, [START + i for i in range(4)], columns)))
-    blocks = data.samples(cloud, data.select("car", "vesc"), data.Reading())
+    blocks = data.samples(cloud, data.select("car", "vesc"))
     assert [value for block in blocks for value in block.columns["temp_motor"].tolist()] == COLD
 
 

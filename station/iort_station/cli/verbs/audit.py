@@ -112,7 +112,8 @@ def _audit(
     from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
     from iort_analysis.samples.batches import RefusedItems  # noqa: PLC0415 - as above
     from iort_station.data import inventory  # noqa: PLC0415 - see above
-    from iort_station.operations import accounts, audit  # noqa: PLC0415 - as above
+    from iort_station.data.accounts import accounts  # noqa: PLC0415 - as above
+    from iort_station.operations import audit  # noqa: PLC0415 - as above
 
     try:
         check_robot(robot)
@@ -120,8 +121,9 @@ def _audit(
     except ContractError as error:
         raise UsageError(str(error)) from error
     figures = audit.last_figures(cloud, robot)
-    audits, archived, now_us = list[Audit](), Origin(), time.time_ns() // 1000
-    told = accounts.accounts(cloud, robot)
+    audits: list[Audit] = []
+    archived, now_us = Origin(), time.time_ns() // 1000
+    told = accounts(cloud, robot)
     with errors.status("reading") as status:
         for name in names:
             origin, refused = Origin(), RefusedItems()
@@ -130,16 +132,16 @@ def _audit(
             )
             counted = _counting(headers, name, status)
             one = audit.audit(name, counted, late_ms=late_us // 1000, from_start=from_start)
-            one = accounts.without_lateness(one, told)
+            one = audit.without_lateness(one, told)
             one = replace(one, refused=refused.count, named=tuple(refused.named))
             # The agent counts a whole run, so a part of one cannot be compared.
             if within == Range(None, None):
-                one = accounts.held_against(one, told, now_us)
+                one = audit.held_against(one, told, now_us)
             if one.runs or one.refused or one.taken is not None or streams:
                 audits.append(one)
                 archived.hours += origin.within(within.start_us, within.end_us).hours
     waiting, dropped = (figures.get(name) for name in ("backlog_batches", "dropped_batches"))
-    in_car = accounts.in_car(None if waiting is None else int(waiting), audits, told)
+    in_car = audit.in_car(None if waiting is None else int(waiting), audits, told)
     dropped = None if dropped is None else int(dropped)
     audits = [replace(one, in_car=in_car, dropped=dropped) for one in audits]
     causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}

@@ -27,7 +27,6 @@ from iort_station.cli.options import AsJson, CloudOptions, Robot, argument, exam
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import control, registry, stopping
-from iort_station.fleet import control as fleet_commands
 from iort_station.fleet.control import Shadow, State
 from iort_station.fleet.stopping import Motion
 from iort_station.operations import alarms
@@ -49,10 +48,8 @@ def send(
     ] = None,
     valid_ms: Annotated[
         int, option("The robot rejects it if it arrives later than this.", min=1, max=MAX_VALID_MS)
-    ] = fleet_commands.VALID_MS,
-    seconds: Annotated[
-        float, option("How long to wait for the robot's answer.", min=0)
-    ] = fleet_commands.ANSWER_S,
+    ] = control.VALID_MS,
+    seconds: Annotated[float, option("How long to wait for the robot's answer.", min=0)] = control.ANSWER_S,
     takeover: Annotated[
         bool, option("Take the wheel from whoever drives; refused otherwise.", "--takeover")
     ] = False,
@@ -66,7 +63,7 @@ def send(
     asked = _message(message)
     cloud = context.obj.cloud()
     with errors.status(f"waiting for {robot}"):
-        command, said, offline = fleet_commands.send(
+        command, said, offline = control.send(
             cloud,
             robot,
             name,
@@ -90,7 +87,7 @@ def send(
             f"downlink.cmd.{name}?"
         )
     if said != ACCEPTED:
-        advice = fleet_commands.advice(said)
+        advice = control.advice(said)
         raise StationError(f"{robot} has rejected {name}: {one_line(said)}{advice and f': {advice}'}")
 
 
@@ -332,8 +329,8 @@ def config(
         rejected = state.rejected()
         _print(robot, state, rejected, {}, as_json=as_json)
         if rejected and not as_json:
-            options = " ".join(f"--unset {name}" for name in rejected)
-            errors.print(f"`iort config {robot} {options}` withdraws what is rejected", soft_wrap=True)
+            unsets = " ".join(f"--unset {name}" for name in rejected)
+            errors.print(f"`iort config {robot} {unsets}` withdraws what is rejected", soft_wrap=True)
         return
     with errors.status(f"waiting for {robot}"):
         state, rejected, online, answer = control.change_settings(cloud, robot, wanted, seconds)
@@ -351,10 +348,8 @@ def config(
 
 
 def _change(text: str) -> tuple[str, Any]:
-    name, equals, written = text.partition("=")
-    if not name or not equals:
-        raise UsageError(f"must be NAME=VALUE, for example live.rate_hz=5, got {text}")
-    return name, control.parse_setting(name, written)
+    name, value = options.assigned(text, "live.rate_hz=5")
+    return name, control.parse_setting(name, value)
 
 
 def _print(

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 import typer
 from rich.console import Group
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from iort_contract.catalog.derived import Vehicle
@@ -25,7 +24,7 @@ from iort_contract.messages.live import decode_live_update
 from iort_contract.page import PUBNUB_ORIGIN
 from iort_contract.tables import ROBOT, T_US
 from iort_station.cli import options
-from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.console import errors, out, table, tell
 from iort_station.cli.options import AsJson, LiveWay, Robot, Token, examples, option, say
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
@@ -116,15 +115,12 @@ def _show(fleet: FleetWatch, viewer: viewing.Viewer, seconds: float | None, name
                 words += f" {fleet.refused} malformed updates, the newest {fleet.newest_refused}."
             if viewer.problem:
                 words += f" {viewer.problem}"
-            table = fleet.table(time.time_ns() // 1000, out.width)
-            live.update(Group(table, Text(words, style="dim")), refresh=True)
+            cars_table = fleet.table(time.time_ns() // 1000, out.width)
+            live.update(Group(cars_table, Text(words, style="dim")), refresh=True)
             tick.wait(_REFRESH_S)
 
 
 # `iort trace`: the delay of live updates, hop by hop.
-
-# Characters of the other columns, and of the longest and shortest whole bar.
-_OTHERS, _LONGEST, _SHORTEST = 64, 30, 8
 
 
 @commands.command("trace", epilog=examples("trace car7 --updates 20"))
@@ -167,10 +163,7 @@ def trace_(
         car_uncertainty_ms=audit.last_figures(cloud, robot).get("clock_uncertainty_ms"),
         newest_rtt=audit.last_batch(cloud, robot, RTT_STREAM),
     )
-    if as_json:
-        print_json(asdict(result))
-    else:
-        _show_trace(robot, result)
+    tell(asdict(result), lambda: _show_trace(robot, result), as_json=as_json, indented=True)
 
 
 def _pubnub_clock(cloud: Cloud) -> trace.ClockOffset:
@@ -180,29 +173,17 @@ def _pubnub_clock(cloud: Cloud) -> trace.ClockOffset:
 
 
 def _show_trace(robot: str, result: trace.Trace) -> None:
-    table = Table(title=f"{robot}: {result.updates} live updates", title_justify="left")
-    for name in ("hop", "median", "95 %", "clocks", ""):
-        table.add_column(name, justify="left" if name in {"hop", ""} else "right")
-    width = max(_SHORTEST, min(_LONGEST, out.width - _OTHERS))
-    whole = max(result.whole.p50_ms, 1e-3)
-    begins = 0.0
+    shown = table(
+        "hop", "median", "95 %", "clocks", left=("hop",), title=f"{robot}: {result.updates} live updates"
+    )
     for hop in result.hops:
-        table.add_row(*_cells(hop), bar(begins / whole, hop.p50_ms / whole, width))
-        begins += max(0.0, hop.p50_ms)
-    table.add_section()
-    table.add_row(*_cells(result.whole), bar(0, 1, width), style="bold")
-    out.print(table)
+        shown.add_row(*_cells(hop))
+    shown.add_row(*_cells(result.whole), style="bold")
+    out.print(shown)
     out.print("clocks: the uncertainty of a hop; ? if two providers' clocks are compared without correction")
     if result.round_trips_ms:
         trips = ", ".join(f"{path} {value:.1f} ms" for path, value in result.round_trips_ms.items())
         out.print(f"round trips that the car measured last: {trips}")
-
-
-def bar(begins: float, share: float, width: int) -> str:
-    """A bar from ``begins`` on, both as shares of ``width`` characters, drawn to an eighth of a character."""
-    before = round(min(max(begins, 0.0), 1.0) * width)
-    eighths = min(round(max(share, 0.0) * width * 8), (width - before) * 8)
-    return " " * before + "█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8].strip()
 
 
 def _cells(hop: trace.Hop) -> tuple[str, ...]:

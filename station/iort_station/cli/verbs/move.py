@@ -20,7 +20,6 @@ from iort_station.fleet import registry
 
 if TYPE_CHECKING:
     from iort_station.migration.plan import Plan
-    from iort_station.migration.recordings import Compared
 
 commands = typer.Typer()
 AWS = "aws"
@@ -143,17 +142,35 @@ class _Moving:
         source, target, topic = self._source, self._target, topic_of(self._source, robot, stream)
         batches = hours = 0
         with errors.status(f"{robot} {stream}") as status:
-            read = _Reading(status.update, f"{robot} {stream}")
+            read = 0
+
+            def progress(more: int) -> None:
+                nonlocal read
+                read += more
+                status.update(f"{robot} {stream}: {read:,} batches read")
+
             if self._units is not None:
                 # Before the batches, which the target's archive adds to these hours.
                 hours = recordings.copy_hours(source, target, topic)
                 for copy in (recordings.copy_batches, recordings.merge_hours):
-                    batches += copy(source, target, topic, units_per_s=self._units, progress=read.tell)
-            found = recordings.compare(source, target, robot, stream, read.tell)
+                    batches += copy(source, target, topic, units_per_s=self._units, progress=progress)
+            found = recordings.compare(source, target, robot, stream, progress)
         if not found.batches:
             return
-        told = _as_json(robot, stream, found)
-        self.streams.append({**told, "copied_batches": batches, "copied_hours": hours})
+        self.streams.append(
+            {
+                "robot": robot,
+                "stream": stream,
+                "batches": found.batches,
+                "samples": sum(run.samples for run in found.audit.runs),
+                "missing": found.audit.missing,
+                "content": found.content,
+                "more": found.more,
+                "problem": found.problem,
+                "copied_batches": batches,
+                "copied_hours": hours,
+            }
+        )
         if found.problem:
             self.problems.append(f"{robot} {stream}: {found.problem}")
         if not self._quiet:
@@ -187,17 +204,6 @@ class _Moving:
             out.print(text, style="red", soft_wrap=True)
 
 
-class _Reading:
-    """Tells how many batches have been read."""
-
-    def __init__(self, show: Any, what: str) -> None:
-        self._show, self._what, self._read = show, what, 0
-
-    def tell(self, batches: int) -> None:
-        self._read += batches
-        self._show(f"{self._what}: {self._read:,} batches read")
-
-
 def _target(source: Cloud, to: str, profile: str | None, region: str | None) -> Cloud:
     if to == AWS:
         try:
@@ -208,19 +214,6 @@ def _target(source: Cloud, to: str, profile: str | None, region: str | None) -> 
     path = Path(to).expanduser()
     path = path / EMBEDDED.name if path.is_dir() else path
     return CloudOptions(source.namespace, None, None, local=True, embedded=path).cloud()
-
-
-def _as_json(robot: str, stream: str, found: Compared) -> dict[str, Any]:
-    return {
-        "robot": robot,
-        "stream": stream,
-        "batches": found.batches,
-        "samples": sum(run.samples for run in found.audit.runs),
-        "missing": found.audit.missing,
-        "content": found.content,
-        "more": found.more,
-        "problem": found.problem,
-    }
 
 
 def _show_plan(plan: Plan, *, with_files: bool) -> None:

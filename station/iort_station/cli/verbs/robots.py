@@ -180,20 +180,14 @@ def tag(
     as_json: AsJson = False,
 ) -> None:
     """Show or change a robot's tags. The page finds and groups robots by them."""
-    wanted = {**dict(map(_change, changes or [])), **dict.fromkeys(remove or [])}
+    wanted: dict[str, str | None] = dict(options.assigned(text, "lab=north") for text in changes or ())
+    wanted |= dict.fromkeys(remove or ())
     now = robots.change_tags(context.obj.cloud(), name, wanted)
     if as_json:
         print_json({"robot": name, "tags": now})
         return
     for key, value in now.items():
         out.print(f"{key}={value}", soft_wrap=True)
-
-
-def _change(text: str) -> tuple[str, str | None]:
-    name, equals, value = text.partition("=")
-    if not name or not equals:
-        raise UsageError(f"must be TAG=VALUE, for example lab=north, got {text}")
-    return name, value
 
 
 # What the cloud's functions keep in the row for themselves.
@@ -298,28 +292,13 @@ def show(context: typer.Context, name: Robot, as_json: AsJson = False) -> None:
     row, held = registry.get(cloud, name), identity.certificates(cloud, name)
     over, motion = control.over_share(cloud, name), stopping.motion(cloud, [name])[name]
     if as_json:
-        print_json(
-            {
-                **_as_json(row),
-                "stoppable": motion.stoppable,
-                tables.OVER_SHARE: over
-                and {
-                    "batches": over.batches,
-                    **stamped("since", over.since_ms * 1000),
-                    **stamped("last", over.last_ms * 1000),
-                },
-                "certificates": [
-                    {
-                        "id": one.id,
-                        "arn": one.arn,
-                        "status": one.status,
-                        **stamped("created", time_us(one.created, 0)),
-                        **stamped("expires", None if one.expires is None else time_us(one.expires, 0)),
-                    }
-                    for one in held
-                ],
-            }
-        )
+        share = over and {
+            "batches": over.batches,
+            **stamped("since", over.since_ms * 1000),
+            **stamped("last", over.last_ms * 1000),
+        }
+        facts = {**_as_json(row), "stoppable": motion.stoppable, tables.OVER_SHARE: share}
+        print_json({**facts, "certificates": list(map(_certificate_as_json, held))})
         return
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(no_wrap=True)
@@ -338,6 +317,12 @@ def show(context: typer.Context, name: Robot, as_json: AsJson = False) -> None:
         until = f", expires {_time(one.expires)}" if one.expires else ""
         table.add_row("certificate", f"{one.id} {one.status}, made {_time(one.created)}{until}")
     out.print(table)
+
+
+def _certificate_as_json(certificate: identity.Certificate) -> dict[str, Any]:
+    expires = None if certificate.expires is None else time_us(certificate.expires, 0)
+    times = stamped("created", time_us(certificate.created, 0)) | stamped("expires", expires)
+    return {"id": certificate.id, "arn": certificate.arn, "status": certificate.status, **times}
 
 
 @commands.command("remove", epilog=examples("robots remove car8 --yes"))
@@ -379,7 +364,7 @@ def _motion(cloud: Cloud, rows: Iterable[Mapping[str, Any]]) -> Mapping[str, sto
 
 
 def _parameter(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
+    name, value = options.assigned(text, "speed_to_erpm_gain=4614")
     try:
         return name, float(value)
     except ValueError as error:
@@ -410,30 +395,26 @@ def _connection(row: Mapping[str, Any]) -> str:
     if row.get(tables.ONLINE):
         return f"online since {_value(tables.CONNECTED_MS, row[tables.CONNECTED_MS])}"
     if tables.DISCONNECTED_MS in row:
-        reason = row.get(tables.DISCONNECT_REASON, "")
-        return (
-            f"offline since {_value(tables.DISCONNECTED_MS, row[tables.DISCONNECTED_MS])} {reason}".rstrip()
-        )
+        since = _value(tables.DISCONNECTED_MS, row[tables.DISCONNECTED_MS])
+        return f"offline since {since} {row.get(tables.DISCONNECT_REASON, '')}".rstrip()
     if tables.ADMIT_UNTIL_S in row and tables.ADMITTED_CERTIFICATE not in row:
-        until_s = int(row[tables.ADMIT_UNTIL_S])
-        return f"{'was expected' if until_s < time.time() else 'expected'} until {iso_s(until_s * 1_000_000)}"
+        was = "was " if int(row[tables.ADMIT_UNTIL_S]) < time.time() else ""
+        return f"{was}expected until {_value(tables.ADMIT_UNTIL_S, row[tables.ADMIT_UNTIL_S])}"
     return "never connected"
 
 
 def _parameters(row: Mapping[str, Any]) -> str:
-    known = {
+    shown = {
         tables.ROBOT,
         tables.GAIN_SET_MS,
-        *tables.DAYS,
         tables.STREAMS,
+        *tables.DAYS,
         *tables.PRESENCE,
         *tables.ADMISSION,
     }
-    return ", ".join(
-        f"{key} {value}"
-        for key, value in sorted(row.items())
-        if key not in known and not key.startswith((tables.ALERT_PREFIX, tables.ASKED_PREFIX))
-    )
+    counters = (tables.ALERT_PREFIX, tables.ASKED_PREFIX)
+    others = (key for key in sorted(row) if key not in shown and not key.startswith(counters))
+    return ", ".join(f"{key} {row[key]}" for key in others)
 
 
 def _value(key: str, value: Any) -> str:

@@ -29,9 +29,10 @@ from iort_station import data
 from iort_station.cli.main import app
 from iort_station.cli.options import CloudOptions
 from iort_station.data import tabular
+from iort_station.data.accounts import accounts
 from iort_station.data.runs import overview, runs
 from iort_station.errors import StationError
-from iort_station.operations import accounts, audit
+from iort_station.operations import audit
 from iort_station.page.answers import answers
 from iort_station.page.history import downloads
 from iort_station.upkeep import deployment
@@ -235,7 +236,7 @@ def test_the_audit_is_the_same(before, cloud, stream):
             audit.audit(stream, audit.headers(one, "car", stream, *between)) for one in (before, cloud)
         )
         assert found == expected
-    assert accounts.accounts(cloud, "car") == accounts.accounts(before, "car")
+    assert accounts(cloud, "car") == accounts(before, "car")
     assert audit.last_figures(cloud, "car") == audit.last_figures(before, "car")
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from iort_contract.messages.account import SourceAccount, StreamAccount
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_station.operations.accounts import held_against, in_car, last_of, without_lateness
-from iort_station.operations.audit import audit
+from iort_station.data.accounts import last_of
+from iort_station.operations.audit import audit, held_against, in_car, without_lateness
 
 T_US, BOOT = 1_750_000_000_000_000, "0badcafe"
 HOUR_US = 3_600_000_000

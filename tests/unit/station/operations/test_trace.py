@@ -8,7 +8,6 @@ import pytest
 
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.live import LiveSample, live_update
-from iort_station.cli.verbs.live import bar
 from iort_station.operations.trace import (
     BROKER,
     CAR,
@@ -87,14 +86,3 @@ def test_round_trips_are_medians_of_the_newest_batch():
     batch = Batch("0badcafe", 0, [1, 2, 3, 4], columns)
     assert round_trips_ms(batch) == {"broker": 2.0, "rule": 5.5}
     assert round_trips_ms(None) == {}
-
-
-@pytest.mark.parametrize(("begins", "share"), [(0, 1), (0.5, 0.5), (0.9, 0.5), (-1, 2), (1, 0), (0.3, -1)])
-def test_bars_stay_inside_their_column(begins, share):
-    assert len(bar(begins, share, 30)) <= 30
-    assert len(bar(begins, share, 8)) <= 8
-
-
-def test_bars_begin_at_the_end_of_the_last():
-    assert bar(0.5, 0.25, 30).index("█") == 15
-    assert bar(0.5, 0.25, 8) == "    ██"
