@@ -21,87 +21,8 @@ from iort_contract.archive import ArchivedHour, Pending, archived_hour, parse_ho
 from iort_contract.codec import DICTIONARY, flat_second, packed, unpacked
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
-from iort_contract.messages.account import SourceAccount, StreamAccount, account
-from iort_contract.messages.analysis import (
-    AnalysedDrive,
-    AnalysisRequest,
-    DriveKey,
-    Estimate,
-    Finding,
-    Note,
-    PlannedDrive,
-    decode_analysed,
-    decode_finding,
-    decode_note,
-    decode_planned,
-    decode_request,
-    encode_analysed,
-    encode_finding,
-    encode_note,
-    encode_planned,
-    encode_request,
-)
-from iort_contract.messages.batch import (
-    Batch,
-    batch_id,
-    decode_batch,
-    decode_item,
-    encode_batch,
-    messages_of,
-    run_ends,
-)
-from iort_contract.messages.commands import (
-    Command,
-    DriveLimits,
-    FleetMessage,
-    decode_command,
-    decode_fleet,
-    decode_limits,
-    encode_command,
-    encode_fleet,
-    encode_limits,
-)
+from iort_contract.messages import account, analysis, batch, commands, files, live, questions
 from iort_contract.messages.envelope import event_message, rule_event
-from iort_contract.messages.files import (
-    Address,
-    File,
-    FileAnswer,
-    FileRequest,
-    decode_file_answer,
-    decode_file_request,
-    encode_file_answer,
-    encode_file_request,
-    file_key,
-    parse_file_key,
-)
-from iort_contract.messages.live import (
-    Lease,
-    LiveSample,
-    decode_lease,
-    decode_live,
-    decode_live_update,
-    decode_pong,
-    encode_lease,
-    encode_live,
-    encode_ping,
-    live_update,
-)
-from iort_contract.messages.questions import (
-    Answer,
-    Ask,
-    QueryAnswer,
-    QueryRequest,
-    decode_answer,
-    decode_ask,
-    decode_query_answer,
-    decode_query_request,
-    encode_answer,
-    encode_ask,
-    encode_query_answer,
-    encode_query_request,
-    packed_samples,
-    unpacked_samples,
-)
 from iort_contract.messages.shadow import decode_desired, decode_reported
 from iort_contract.ros1.columns import as_columns, decoder_of, from_columns, view
 from iort_contract.ros1.definition import parse
@@ -121,25 +42,25 @@ RAWS = [header() + struct.pack("<dB", i / 2, i) for i in range(3)]
 TEXTS = [struct.pack("<I", 2) + text("a") + text("b") + struct.pack("<I", 0) * 2 for _ in range(3)]
 TIMES = [T_US, T_US + 1000, T_US + 2000]
 BATCHES = [
-    Batch(RUN, 3, TIMES, {"speed": [1.5, 2.25, 3], "mode": ["a", None, True], "n": [1, 2, 3]}, 1),
-    Batch(RUN, 0, TIMES, {"speed": [1.5, 2.25, 3], "volts": [7, 8, 9]}, 0, None, ()),
-    Batch(RUN, 4, TIMES, {}, 0, Messages(FLAT.id, FLAT.layout, RAWS)),
-    Batch(RUN, 5, TIMES, {"note": ["a", "b", None]}, 0, Messages(NAMES.id, NAMES.layout, TEXTS)),
+    batch.Batch(RUN, 3, TIMES, {"speed": [1.5, 2.25, 3], "mode": ["a", None, True], "n": [1, 2, 3]}, 1),
+    batch.Batch(RUN, 0, TIMES, {"speed": [1.5, 2.25, 3], "volts": [7, 8, 9]}, 0, None, ()),
+    batch.Batch(RUN, 4, TIMES, {}, 0, Messages(FLAT.id, FLAT.layout, RAWS)),
+    batch.Batch(RUN, 5, TIMES, {"note": ["a", "b", None]}, 0, Messages(NAMES.id, NAMES.layout, TEXTS)),
 ]
-ITEMS = [item_of(batch) for batch in BATCHES]
+ITEMS = list(map(item_of, BATCHES))
 COLUMNS, ABOUT = as_columns(BATCHES[2].messages, TIMES)
-DRIVE, ESTIMATE = DriveKey("car7", T_US, RUN), Estimate(0.03, 0.02, 0.04, "ohm")
-FINDING = Finding(
+DRIVE, ESTIMATE = analysis.DriveKey("car7", T_US, RUN), analysis.Estimate(0.03, 0.02, 0.04, "ohm")
+FINDING = analysis.Finding(
     DRIVE, "battery_worn", "warning", "a", 1, 2, "vesc", ("volts",), "worn", ESTIMATE, ESTIMATE, 0.1
 )
-FILE = File("a/b.bag", "recording", "application/x-rosbag", 5, "0" * 64, T_US)
+FILE = files.File("a/b.bag", "recording", "application/x-rosbag", 5, "0" * 64, T_US)
 SHADOW = {
     "live": {"rate_hz": 5},
     "rejected": {"live.rate_hz": {"value": 50, "reason": "must be 0.1 to 10"}},
     "commands": {"go": {"session": RUN, "seq": 1, "outcome": "done"}},
     "stops": {"robot": {"by": "me", "t_ms": 1}},
     "over_share": {"since_ms": 1, "last_ms": 2, "batches": 3},
-    "drive": encode_limits(DriveLimits("go", "speed", "angle", 1.0, 0.4, 300)),
+    "drive": commands.encode_limits(commands.DriveLimits("go", "speed", "angle", 1.0, 0.4, 300)),
 }
 ROW = ArchivedHour("dt/iort/car/vesc", "2023-11-14T22", "a.parquet", 1, 2, 0, "c", "d", 5, 6, 7).item()
 TRACK = "# x_m, y_m, w_right_m, w_left_m\n0, 0, 1, 1\n4, 0, 1, 1\n4, 4, 1, 1\n0, 4, 1, 1\n"
@@ -178,20 +99,20 @@ of_bytes = partial(Decoder, mutated_bytes)
 of_json = partial(Decoder, mutated_json)
 of_values = partial(Decoder, mutated_value)
 of_items = partial(Decoder, mutated_item)
-MESSAGES = tuple(encode_batch(batch) for batch in BATCHES)
-LIVE = LiveSample(RUN, 4, T_US, T_US + 5, {"speed": 1.5, "mode": "a"}, 0, 7, 100)
+MESSAGES = tuple(map(batch.encode_batch, BATCHES))
+LIVE = live.LiveSample(RUN, 4, T_US, T_US + 5, {"speed": 1.5, "mode": "a"}, 0, 7, 100)
 DECODERS: Mapping[str, Decoder] = {
     # The record lane.
-    "batch": of_json(decode_batch, MESSAGES),
-    "batch of an item": of_items(lambda item: decode_batch(plain(item)), ITEMS),
-    "item": of_items(lambda item: decode_item(plain(item)), ITEMS),
-    "messages of an item": of_items(lambda item: messages_of(plain(item), LAYOUTS), ITEMS),
+    "batch": of_json(batch.decode_batch, MESSAGES),
+    "batch of an item": of_items(lambda item: batch.decode_batch(plain(item)), ITEMS),
+    "item": of_items(lambda item: batch.decode_item(plain(item)), ITEMS),
+    "messages of an item": of_items(lambda item: batch.messages_of(plain(item), LAYOUTS), ITEMS),
     "columns of items": of_items(lambda item: columns([ITEMS[0], item, ITEMS[1]]), ITEMS),
     "columns of an item": of_items(lambda item: columns([item]), ITEMS),
     "batches of items": of_items(lambda item: list(batches_of([ITEMS[0], item])), ITEMS, total=True),
     "drive": of_items(lambda item: recorded(DRIVE, T_US + 9999, "vesc", [ITEMS[0], item]), ITEMS, total=True),
-    "batch id": of_texts(batch_id, f"{T_US}-{RUN}-3"),
-    "run ends": of_texts(run_ends, f"{RUN}-3 1{RUN}-0", ""),
+    "batch id": of_texts(batch.batch_id, f"{T_US}-{RUN}-3"),
+    "run ends": of_texts(batch.run_ends, f"{RUN}-3 1{RUN}-0", ""),
     "column": of_values(
         lambda value: unpacked("a", value, 3), (packed([1, 2, 4]), packed([0.5, 1, 2]), [None, "a", 1, True])
     ),
@@ -211,73 +132,96 @@ DECODERS: Mapping[str, Decoder] = {
     "ROS layout": of_texts(lambda text: decoder_of(text).decode(RAWS[0]), FLAT.layout),
     "message type": of_values(message_type, (MessageType("s", "/s", "a/A", "1", "float64 x").sample(),)),
     # The live lane and the pings.
-    "live": of_json(decode_live, (encode_live(LIVE),)),
+    "live": of_json(live.decode_live, (live.encode_live(LIVE),)),
     "live update": of_values(
-        decode_live_update, (live_update("car", "vesc", LIVE, 1, 2), live_update("car", "vesc", LIVE))
+        live.decode_live_update,
+        (live.live_update("car", "vesc", LIVE, 1, 2), live.live_update("car", "vesc", LIVE)),
     ),
-    "pong": of_json(decode_pong, (encode_ping(7, T_US),)),
+    "pong": of_json(live.decode_pong, (live.encode_ping(7, T_US),)),
     "event": of_values(event_message, (rule_event(b"x", "live/iort/car/vesc", 5),)),
     # To and from robots.
     "command": of_json(
-        decode_command, (encode_command(Command(RUN, 1, 2, 3, 400, {"a": 1}, 100, True, "me")),)
+        commands.decode_command,
+        (commands.encode_command(commands.Command(RUN, 1, 2, 3, 400, {"a": 1}, 100, True, "me")),),
     ),
-    "fleet message": of_json(decode_fleet, (encode_fleet(FleetMessage(RUN, 1, T_US, {"a": 1}, 5)),)),
-    "lease": of_json(decode_lease, (encode_lease(Lease(RUN, 5.0, 1000)),)),
-    "limits": of_values(decode_limits, (SHADOW["drive"],), total=True),
+    "fleet message": of_json(
+        commands.decode_fleet, (commands.encode_fleet(commands.FleetMessage(RUN, 1, T_US, {"a": 1}, 5)),)
+    ),
+    "lease": of_json(live.decode_lease, (live.encode_lease(live.Lease(RUN, 5.0, 1000)),)),
+    "limits": of_values(commands.decode_limits, (SHADOW["drive"],), total=True),
     "desired": of_values(decode_desired, (SHADOW,), total=True),
     "reported": of_values(decode_reported, (SHADOW,), total=True),
     "account": of_values(
-        account,
+        account.account,
         (
-            StreamAccount("vesc", 5, 5, 0, 0, 0, 2, ended=True).sample(),
-            SourceAccount("ros", {"/a.empty": 2}).sample(),
+            account.StreamAccount("vesc", 5, 5, 0, 0, 0, 2, ended=True).sample(),
+            account.SourceAccount("ros", {"/a.empty": 2}).sample(),
         ),
     ),
     # Requests and their answers.
     "query request": of_values(
-        decode_query_request,
-        (json.loads(encode_query_request(QueryRequest("car", "vesc", 5, 9, ("a",), "a > 1"))),),
+        questions.decode_query_request,
+        (
+            json.loads(
+                questions.encode_query_request(questions.QueryRequest("car", "vesc", 5, 9, ("a",), "a > 1"))
+            ),
+        ),
     ),
     "query answer": of_json(
-        decode_query_answer,
+        questions.decode_query_answer,
         (
             json.dumps(
-                encode_query_answer(QueryAnswer(2, ("a",), 3, 1, 1, "codec", {"a": 2}, None, b"x"))
+                questions.encode_query_answer(
+                    questions.QueryAnswer(2, ("a",), 3, 1, 1, "codec", {"a": 2}, None, b"x")
+                )
             ).encode(),
         ),
     ),
-    "query samples": of_bytes(unpacked_samples, (packed_samples(TIMES, {"a": [1, None, "x"]}),)),
+    "query samples": of_bytes(
+        questions.unpacked_samples, (questions.packed_samples(TIMES, {"a": [1, None, "x"]}),)
+    ),
     "query samples' text": of_json(
-        lambda text: unpacked_samples(zlib.compress(text)),
-        (zlib.decompress(packed_samples(TIMES, {"a": [1, None, "x"], "b": [1, 2, 3]})),),
+        lambda text: questions.unpacked_samples(zlib.compress(text)),
+        (zlib.decompress(questions.packed_samples(TIMES, {"a": [1, None, "x"], "b": [1, 2, 3]})),),
     ),
     "file request": of_json(
-        decode_file_request, (encode_file_request(FileRequest(RUN, FILE, {1: "0" * 64})),)
+        files.decode_file_request, (files.encode_file_request(files.FileRequest(RUN, FILE, {1: "0" * 64})),)
     ),
     "file answer": of_json(
-        decode_file_answer,
-        (encode_file_answer(FileAnswer(RUN, "k", have=((1, 2),), addresses=(Address(3, "u", {"a": "b"}),))),),
+        files.decode_file_answer,
+        (
+            files.encode_file_answer(
+                files.FileAnswer(RUN, "k", have=((1, 2),), addresses=(files.Address(3, "u", {"a": "b"}),))
+            ),
+        ),
     ),
-    "file key": of_texts(parse_file_key, file_key("car", FILE)),
-    "question": of_json(decode_ask, (encode_ask(Ask(RUN, T_US, 500, {"a": 1}, 5)),)),
-    "answer": of_json(decode_answer, (encode_answer(Answer(RUN, {"a": 1})),)),
+    "file key": of_texts(files.parse_file_key, files.file_key("car", FILE)),
+    "question": of_json(
+        questions.decode_ask, (questions.encode_ask(questions.Ask(RUN, T_US, 500, {"a": 1}, 5)),)
+    ),
+    "answer": of_json(questions.decode_answer, (questions.encode_answer(questions.Answer(RUN, {"a": 1})),)),
     "track": of_texts(parse_track, TRACK),
     "track of lists": of_values(track_of, (json_of(vars(parse_track(TRACK))),)),
     # The analysis.
-    "finding": of_values(decode_finding, (json_of(encode_finding(FINDING)),)),
-    "note": of_values(decode_note, (encode_note(Note("car7", T_US, "a", "me", "0badcafe")),)),
+    "finding": of_values(analysis.decode_finding, (json_of(analysis.encode_finding(FINDING)),)),
+    "note": of_values(
+        analysis.decode_note, (analysis.encode_note(analysis.Note("car7", T_US, "a", "me", "0badcafe")),)
+    ),
     "analysis request": of_values(
-        lambda content: decode_request(content, T_US),
-        (encode_request(AnalysisRequest(("car",), 1, 9)), {"last_s": 60}),
+        lambda content: analysis.decode_request(content, T_US),
+        (analysis.encode_request(analysis.AnalysisRequest(("car",), 1, 9)), {"last_s": 60}),
     ),
     "planned drive": of_values(
-        decode_planned, (encode_planned(PlannedDrive(DRIVE, T_US + 5, ("vesc",), "vesc")),)
+        analysis.decode_planned,
+        (analysis.encode_planned(analysis.PlannedDrive(DRIVE, T_US + 5, ("vesc",), "vesc")),),
     ),
     "analysed drive": of_values(
-        decode_analysed,
+        analysis.decode_analysed,
         (
             json_of(
-                encode_analysed(AnalysedDrive(DRIVE, 5, "job", 9, {"a": ESTIMATE}, {"b": "no"}, {"c": 1}))
+                analysis.encode_analysed(
+                    analysis.AnalysedDrive(DRIVE, 5, "job", 9, {"a": ESTIMATE}, {"b": "no"}, {"c": 1})
+                )
             ),
         ),
     ),

@@ -15,39 +15,8 @@ from hypothesis import strategies as st
 from iort_contract.catalog.analysis import KINDS, PARAMETERS
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import (
-    MAX_NOTE_CHARACTERS,
-    DriveKey,
-    Estimate,
-    Finding,
-    Note,
-    decode_finding,
-    decode_note,
-    encode_finding,
-    encode_note,
-)
+from iort_contract.messages import analysis, commands, live, questions
 from iort_contract.messages.batch import decode_batch, encode_batch
-from iort_contract.messages.commands import (
-    Command,
-    FleetMessage,
-    decode_command,
-    decode_fleet,
-    encode_command,
-    encode_fleet,
-)
-from iort_contract.messages.live import decode_live, decode_pong, encode_live
-from iort_contract.messages.questions import (
-    FIRST_US,
-    LAST_US,
-    QueryAnswer,
-    QueryRequest,
-    decode_query_answer,
-    decode_query_request,
-    encode_query_answer,
-    encode_query_request,
-    packed_samples,
-    unpacked_samples,
-)
 from tests.examples import examples
 from tests.unit.contract.contract_values import DEEP, GOOD, GOOD_LIVE, decode_or_refuse
 
@@ -70,14 +39,14 @@ TIMES = st.integers(0, 2**53 - 1)
 def test_a_command_is_decoded_as_it_was_encoded(
     session: str, times: tuple[int, int], seq: int, holds: tuple[int, int | None], message: Any
 ) -> None:
-    command = Command(session, min(times), seq, max(times), holds[0], message, holds[1])
-    assert decode_command(encode_command(command)) == command
+    command = commands.Command(session, min(times), seq, max(times), holds[0], message, holds[1])
+    assert commands.decode_command(commands.encode_command(command)) == command
 
 
 @given(st.integers(0, 2**53), TIMES, MESSAGES)
 def test_a_fleet_message_is_decoded_as_it_was_encoded(seq: int, sent: int, message: Any) -> None:
-    heard = FleetMessage("0badcafe", seq, sent, message)
-    assert decode_fleet(encode_fleet(heard)) == heard
+    heard = commands.FleetMessage("0badcafe", seq, sent, message)
+    assert commands.decode_fleet(commands.encode_fleet(heard)) == heard
 
 
 @pytest.mark.parametrize(
@@ -91,12 +60,12 @@ def test_a_fleet_message_is_decoded_as_it_was_encoded(seq: int, sent: int, messa
     ],
 )  # fmt: skip
 def test_an_invalid_command_is_refused(change: dict[str, Any]) -> None:
-    good = Command("feedbeef", T0, 0, T0, 500, {"data": 1}, 300)
+    good = commands.Command("feedbeef", T0, 0, T0, 500, {"data": 1}, 300)
     with pytest.raises(ContractError):
-        encode_command(replace(good, **change))
+        commands.encode_command(replace(good, **change))
     if not isinstance(change.get("message"), dict):
         with pytest.raises(ContractError):
-            decode_command(json.dumps({**json.loads(encode_command(good)), **change}))
+            commands.decode_command(json.dumps({**json.loads(commands.encode_command(good)), **change}))
 
 
 @pytest.mark.parametrize(
@@ -104,31 +73,37 @@ def test_an_invalid_command_is_refused(change: dict[str, Any]) -> None:
     [{"boot": "x"}, {"seq": -1}, {"sent_us": 2**60}, {"offset_us": 2**60}, {"message": []}, {"v": 2}],
 )
 def test_an_invalid_fleet_message_is_refused(change: dict[str, Any]) -> None:
-    good = FleetMessage("0badcafe", 0, T0, {})
+    good = commands.FleetMessage("0badcafe", 0, T0, {})
     with pytest.raises(ContractError):
-        decode_fleet(json.dumps({**json.loads(encode_fleet(good)), **change}))
+        commands.decode_fleet(json.dumps({**json.loads(commands.encode_fleet(good)), **change}))
     if "v" not in change:
         with pytest.raises(ContractError):
-            encode_fleet(replace(good, **change))
+            commands.encode_fleet(replace(good, **change))
 
 
 # Query messages are decoded as they were encoded; invalid ones are refused.
 
-REQUEST = QueryRequest("car", "vesc", 5, 9, ("speed",), "speed > 1", True, {"topic": {"S": "t"}})
+REQUEST = questions.QueryRequest("car", "vesc", 5, 9, ("speed",), "speed > 1", True, {"topic": {"S": "t"}})
 TIMES_US, COLUMNS = [1_700_000_000_000_000, 1_700_000_000_020_000], {"speed": [1.5, None]}
-SAMPLES = packed_samples(TIMES_US, COLUMNS)
-ANSWER = QueryAnswer(2, ("speed",), 3, 1, 1, "codec", {"temp_fet": 2}, {"topic": {"S": "t"}}, SAMPLES)
+SAMPLES = questions.packed_samples(TIMES_US, COLUMNS)
+ANSWER = questions.QueryAnswer(
+    2, ("speed",), 3, 1, 1, "codec", {"temp_fet": 2}, {"topic": {"S": "t"}}, SAMPLES
+)
 
 
-@pytest.mark.parametrize("request_", [REQUEST, QueryRequest("car", "vesc")])
-def test_a_request_is_decoded_as_it_was_encoded(request_: QueryRequest) -> None:
-    assert decode_query_request(json.loads(encode_query_request(request_))) == request_
+@pytest.mark.parametrize("request_", [REQUEST, questions.QueryRequest("car", "vesc")])
+def test_a_request_is_decoded_as_it_was_encoded(request_: questions.QueryRequest) -> None:
+    assert questions.decode_query_request(json.loads(questions.encode_query_request(request_))) == request_
 
 
 def test_a_request_needs_only_robot_and_stream_and_its_times_are_clamped() -> None:
-    assert decode_query_request({"robot": "car", "stream": "vesc"}) == QueryRequest("car", "vesc")
-    far = decode_query_request({"robot": "car", "stream": "vesc", "start_us": -(2**60), "end_us": 2**60})
-    assert (far.start_us, far.end_us) == (FIRST_US, LAST_US)
+    assert questions.decode_query_request({"robot": "car", "stream": "vesc"}) == questions.QueryRequest(
+        "car", "vesc"
+    )
+    far = questions.decode_query_request(
+        {"robot": "car", "stream": "vesc", "start_us": -(2**60), "end_us": 2**60}
+    )
+    assert (far.start_us, far.end_us) == (questions.FIRST_US, questions.LAST_US)
 
 
 @pytest.mark.parametrize(
@@ -147,15 +122,20 @@ def test_a_request_needs_only_robot_and_stream_and_its_times_are_clamped() -> No
 )
 def test_an_invalid_request_is_refused(change: dict[str, object], reason: str) -> None:
     with pytest.raises(ContractError, match=reason):
-        decode_query_request({"robot": "car", "stream": "vesc", **change})
+        questions.decode_query_request({"robot": "car", "stream": "vesc", **change})
 
 
 @pytest.mark.parametrize(
     "answer",
-    [ANSWER, QueryAnswer(url="https://there"), QueryAnswer(samples=b""), QueryAnswer(error="no condition")],
+    [
+        ANSWER,
+        questions.QueryAnswer(url="https://there"),
+        questions.QueryAnswer(samples=b""),
+        questions.QueryAnswer(error="no condition"),
+    ],
 )
-def test_an_answer_is_decoded_as_it_was_encoded(answer: QueryAnswer) -> None:
-    assert decode_query_answer(json.dumps(encode_query_answer(answer))) == answer
+def test_an_answer_is_decoded_as_it_was_encoded(answer: questions.QueryAnswer) -> None:
+    assert questions.decode_query_answer(json.dumps(questions.encode_query_answer(answer))) == answer
 
 
 @pytest.mark.parametrize(
@@ -173,19 +153,19 @@ def test_an_answer_is_decoded_as_it_was_encoded(answer: QueryAnswer) -> None:
 )
 def test_an_invalid_answer_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(ContractError):
-        decode_query_answer(json.dumps({**encode_query_answer(ANSWER), **change}))
+        questions.decode_query_answer(json.dumps({**questions.encode_query_answer(ANSWER), **change}))
 
 
 def test_samples_are_unpacked_as_they_were_packed() -> None:
-    assert unpacked_samples(SAMPLES) == (TIMES_US, COLUMNS)
-    assert unpacked_samples(packed_samples([], {})) == ([], {})
+    assert questions.unpacked_samples(SAMPLES) == (TIMES_US, COLUMNS)
+    assert questions.unpacked_samples(questions.packed_samples([], {})) == ([], {})
     with pytest.raises(ContractError, match="packs"):
-        unpacked_samples(SAMPLES[:-3])
+        questions.unpacked_samples(SAMPLES[:-3])
 
 
 # What every decoder of messages refuses; tests/unit/analysis/test_decoders.py damages valid ones.
 
-DECODERS = [decode_batch, decode_live, decode_pong]
+DECODERS = [decode_batch, live.decode_live, live.decode_pong]
 # Values of boto3 and Python that JSON does not have.
 awkward = st.sampled_from(
     [
@@ -196,7 +176,7 @@ awkward = st.sampled_from(
 
 
 @examples(200)
-@given(st.sampled_from([encode_batch(GOOD), encode_live(GOOD_LIVE)]), st.data(), awkward)
+@given(st.sampled_from([encode_batch(GOOD), live.encode_live(GOOD_LIVE)]), st.data(), awkward)
 def test_a_message_with_an_awkward_value_is_decoded_or_refused(message, data, value):
     envelope = json.loads(message)
     envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
@@ -204,9 +184,9 @@ def test_a_message_with_an_awkward_value_is_decoded_or_refused(message, data, va
         decode_or_refuse(decoder, envelope)
 
 
-@pytest.mark.parametrize("good", [encode_batch(GOOD), encode_live(GOOD_LIVE)], ids=["batch", "live"])
+@pytest.mark.parametrize("good", [encode_batch(GOOD), live.encode_live(GOOD_LIVE)], ids=["batch", "live"])
 def test_a_message_with_one_key_removed_is_decoded_or_refused(good):
-    decoder = decode_batch if b"codec" in good else decode_live
+    decoder = decode_batch if b"codec" in good else live.decode_live
     for key in json.loads(good):
         envelope = json.loads(good)
         del envelope[key]
@@ -247,8 +227,8 @@ def test_the_error_for_a_long_value_is_short():
 
 # Findings survive JSON, and anything else is refused.
 
-FINDING = Finding(
-    drive=DriveKey("car7", 1_700_000_000_000_000, "00c0ffee"),
+FINDING = analysis.Finding(
+    drive=analysis.DriveKey("car7", 1_700_000_000_000_000, "00c0ffee"),
     kind="battery_worn",
     severity="warning",
     subject="battery_resistance_ohm",
@@ -257,13 +237,13 @@ FINDING = Finding(
     stream="vesc",
     fields=("voltage_input", "current_input"),
     text="the internal resistance has grown",
-    effect=Estimate(0.03, 0.02, 0.04, "ohm"),
+    effect=analysis.Estimate(0.03, 0.02, 0.04, "ohm"),
     p=0.001,
 )
 
 
 def test_a_finding_survives_json() -> None:
-    assert decode_finding(json.loads(json.dumps(encode_finding(FINDING)))) == FINDING
+    assert analysis.decode_finding(json.loads(json.dumps(analysis.encode_finding(FINDING)))) == FINDING
 
 
 @pytest.mark.parametrize(
@@ -279,7 +259,7 @@ def test_a_finding_survives_json() -> None:
 )
 def test_what_is_no_finding_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(ContractError):
-        decode_finding({**encode_finding(FINDING), **change})
+        analysis.decode_finding({**analysis.encode_finding(FINDING), **change})
 
 
 def test_every_parameter_names_a_kind_that_exists() -> None:
@@ -291,9 +271,9 @@ def test_every_parameter_names_a_kind_that_exists() -> None:
 FIRST_NOTE_US = 1_700_000_000_000_000
 
 
-def note(seconds: int = 0, **given: Any) -> Note:
+def note(seconds: int = 0, **given: Any) -> analysis.Note:
     told = {"robot": "car7", "text": "changed tyre", "by": "ada@lab", "salt": f"{seconds:08x}"}
-    return Note(t_us=FIRST_NOTE_US + seconds * 1_000_000, **{**told, **given})
+    return analysis.Note(t_us=FIRST_NOTE_US + seconds * 1_000_000, **{**told, **given})
 
 
 class OneTable:
@@ -337,7 +317,7 @@ def test_notes_are_rows_beside_the_findings() -> None:
     "change",
     [
         {"text": " "},
-        {"text": "x" * (MAX_NOTE_CHARACTERS + 1)},
+        {"text": "x" * (analysis.MAX_NOTE_CHARACTERS + 1)},
         {"by": "x" * 65},
         {"t_us": -1},
         {"t_us": 10**16},
@@ -347,6 +327,6 @@ def test_notes_are_rows_beside_the_findings() -> None:
 )
 def test_what_is_no_note_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ContractError):
-        decode_note({**encode_note(note()), **change})
+        analysis.decode_note({**analysis.encode_note(note()), **change})
     with pytest.raises(ContractError):
-        encode_note(decode_note({**vars(note()), **change}))
+        analysis.encode_note(analysis.decode_note({**vars(note()), **change}))
