@@ -120,7 +120,10 @@ def encode_result(result: DriveResult) -> dict[str, Any]:
         "vesc": result.vesc,
         "estimates": {name: encode_estimate(one) for name, one in result.mined.estimates.items()},
         "missing": dict(result.mined.missing),
-        "events": [_encode_event(event) for event in result.mined.events],
+        "events": [
+            {**event._asdict(), "effect": event.effect and encode_estimate(event.effect)}
+            for event in result.mined.events
+        ],
     }
 
 
@@ -139,11 +142,6 @@ def decode_result(content: Mapping[str, Any]) -> DriveResult:
         mined=mined,
         vesc=content["vesc"],
     )
-
-
-def _encode_event(event: Event) -> dict[str, Any]:
-    effect = None if event.effect is None else encode_estimate(event.effect)
-    return {**event._asdict(), "effect": effect}
 
 
 def _decode_event(content: Mapping[str, Any]) -> Event:

@@ -175,7 +175,11 @@ def runs(array: Any) -> tuple[list[Any], Any]:
 def write_table(table: Table) -> bytes:
     """A table as a Parquet file."""
     columns = {
-        name: pa.array(column if column.dtype.kind in "fiub" else _texts(column))
+        name: pa.array(
+            column
+            if column.dtype.kind in "fiub"
+            else [v if v is None or isinstance(v, str) else json.dumps(v) for v in column.tolist()]
+        )
         for name, column in table.items()
     }
     file = io.BytesIO()
@@ -187,9 +191,3 @@ def read_table(content: bytes) -> dict[str, np.ndarray]:
     """The columns of a file that `write_table` wrote."""
     table = pq.read_table(io.BytesIO(content))
     return {name: table[name].to_numpy() for name in table.column_names}
-
-
-def _texts(column: np.ndarray) -> list[str | None]:
-    return [
-        value if value is None or isinstance(value, str) else json.dumps(value) for value in column.tolist()
-    ]

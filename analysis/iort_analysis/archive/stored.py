@@ -233,7 +233,8 @@ class Stored:
                     yield _told(items, progress)
                 beside = [item for items in table.until(_first_key(hour.end_us)) for item in items]
                 try:
-                    found = self._with(beside, row, content(), keys)
+                    read_ahead = None if content is None else content.result()
+                    found = self._with(beside, row, read_ahead, keys)
                 except ArchiveError as error:
                     self.refused.add(error, f"{row.samples:,} samples of {row.hour}")
                     found = beside
@@ -274,7 +275,7 @@ class Stored:
 
     def _ahead(
         self, pool: ThreadPoolExecutor, rows: Sequence[ArchivedHour], read: Callable[[HourFile], _T]
-    ) -> Iterator[tuple[ArchivedHour, Callable[[], _T | None]]]:
+    ) -> Iterator[tuple[ArchivedHour, Future[_T] | None]]:
         """The hours with what ``read`` makes of them; while the caller uses one, the next ones are read."""
         coming: deque[tuple[ArchivedHour, Future[_T] | None]] = deque()
         left = deque(rows)
@@ -287,7 +288,7 @@ class Stored:
                 content = None if row.refused else pool.submit(self._archive.read, row, read)
                 coming.append((row, content))
             row, content = coming.popleft()
-            yield row, _nothing if content is None else content.result
+            yield row, content
 
     def _with(
         self, beside: Sequence[Item], row: ArchivedHour, content: _T | None, keys: Keys
@@ -330,10 +331,6 @@ class _Archived(Generic[_T]):
     """What was made of an hour in the archive."""
 
     content: _T
-
-
-def _nothing() -> None:
-    """Of an hour that is not read ahead."""
 
 
 def only(batch: BatchId) -> Keys:

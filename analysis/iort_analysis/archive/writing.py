@@ -39,7 +39,7 @@ from iort_contract.checks import integer
 from iort_contract.codec import EXACT, packed_samples, unpacked
 from iort_contract.dynamodb import Item, plain, whole
 from iort_contract.limits import ContractError, Value
-from iort_contract.messages.batch import BatchId, Envelope, open_envelope, read_envelope
+from iort_contract.messages.batch import Envelope, open_envelope, read_envelope
 from iort_contract.ros1.columns import view
 from iort_contract.ros1.message import Messages, unpack
 from iort_contract.tables import BATCH, EXPIRES_S, NONFINITE, PREVIOUS, RECEIVED_MS
@@ -68,9 +68,7 @@ class _Entry(NamedTuple):
     messages, if it has them as published, with the fields in them."""
 
     item: Item
-    id: BatchId
-    n: int
-    nonfinite: int
+    envelope: Envelope
     about: str
     names: Sequence[str]
     messages: Messages | None = None
@@ -102,7 +100,7 @@ def _decoded(items: Iterable[Item], refuse: Refuse) -> Iterator[tuple[list[_Entr
     """The valid items some at a time, with all their samples."""
     for _, same in groupby(_envelopes(items, refuse), key=lambda one: one[2] and one[2].names):
         while run := list(islice(same, _TOGETHER)):
-            steps = [written for _, _, written in run if written is not None]
+            steps = [own for _, _, own in run if own is not None]
             block = decode_steps(steps, lambda _name: True) if len(steps) == len(run) else None
             if block is not None:
                 yield [_of_steps(item, envelope, block) for item, envelope, _ in run], block
@@ -130,24 +128,25 @@ def _envelopes(items: Iterable[Item], refuse: Refuse) -> Iterator[tuple[Item, En
 
 
 def _of_steps(item: Item, envelope: Envelope, block: Block) -> _Entry:
-    key = BatchId(envelope.first_us, envelope.boot, envelope.seq)
-    about = envelope.behind.decode()
-    return _Entry(item, key, envelope.n, envelope.nonfinite, about, list(block.columns))
+    return _Entry(item, _head(envelope), envelope.about, list(block.columns))
+
+
+def _head(envelope: Envelope) -> Envelope:
+    """The envelope without its samples, which would stay in memory for the whole piece."""
+    return envelope._replace(text=b"", behind=b"")
 
 
 def _alone(item: Item, envelope: Envelope) -> tuple[_Entry, Block]:
     """A batch in any form; raises `ContractError`."""
-    boot, seq, times, nonfinite, columns, serialized, about, _ = open_envelope(envelope)
-    n = len(times)
+    times, columns = open_envelope(envelope)
+    n, about = len(times), envelope.about
     beside = {name: unpacked(name, column, n) for name, column in columns.items()}
     texts = sum(len(value) for column in beside.values() for value in column if type(value) is str)
     if texts + len(about) > _MUCH_TEXT:
         packed_samples([0] * n, beside, about.encode())
-    messages = None if serialized is None else unpack(serialized, n)
+    messages = unpack(envelope.behind, n) if envelope.serialized else None
     viewed = {} if messages is None else view(messages)[0]
-    entry = _Entry(
-        item, BatchId(times[0], boot, seq), n, nonfinite, about, list(beside), messages, list(viewed)
-    )
+    entry = _Entry(item, _head(envelope), about, list(beside), messages, list(viewed))
     samples = {name: _exact(values) for name, values in {**viewed, **beside}.items()}
     return entry, Block(np.array(times, dtype=np.int64), samples)
 
@@ -161,17 +160,19 @@ def _exact(values: Sequence[Value]) -> Column:
 def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:
     entries = [one for part, _ in parts for one in part]
     block = join([part for _, part in parts])
-    counts = np.array([one.n for one in entries])
-    messages = [raw for one in entries for raw in _raws(one)]
+    counts = np.array([one.envelope.n for one in entries])
+    messages = [
+        raw for one in entries for raw in (one.messages.raw if one.messages else [None] * one.envelope.n)
+    ]
     own = {
         names.TIME: pa.array(block.times_us, type=OWN[names.TIME]),
         names.MESSAGE: pa.array(messages, type=OWN[names.MESSAGE]),
         names.OTHER: pa.nulls(len(block.times_us), OWN[names.OTHER]),
     }
     of_batches: dict[str, list[Any]] = {
-        names.BATCH_ID: [str(one.id) for one in entries],
+        names.BATCH_ID: [str(one.envelope.id) for one in entries],
         names.RECEIVED: [_received_ms(one.item) for one in entries],
-        names.NOT_FINITE: [one.nonfinite if NONFINITE in one.item else None for one in entries],
+        names.NOT_FINITE: [one.envelope.nonfinite if NONFINITE in one.item else None for one in entries],
         names.PREVIOUS_RUNS: [one.item[PREVIOUS]["S"] if PREVIOUS in one.item else None for one in entries],
         names.HASH: [item_hash(one.item) for one in entries],
         names.FIELDS: [_fields(one) for one in entries],
@@ -183,10 +184,6 @@ def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:
     kinds = {name: kind_of(column) for name, column in block.columns.items()}
     own.update({named(name): to_arrow(column, kinds[name]) for name, column in block.columns.items()})
     return Piece(pa.table(own), kinds, len(entries))
-
-
-def _raws(one: _Entry) -> Iterable[bytes | None]:
-    return [None] * one.n if one.messages is None else one.messages.raw
 
 
 def _received_ms(item: Item) -> int | None:
@@ -267,7 +264,9 @@ def write_hour(
             stream.write_table(piece.table)
     if places:
         scratch.seek(0)
-        tables = ((_read(scratch), local) for local in places)
+        # Each piece is one batch of Arrow's.
+        streams = (pa.ipc.open_stream(scratch).read_all().combine_chunks() for _ in places)
+        tables = ((stream.to_batches()[0], local) for stream, local in zip(streams, places, strict=True))
         _write(into, kinds, tables, {str(hour): (0, len(places))}, describe)
     ordered = content_hash(sorted(hashes))
     return Written(batches, samples, dict(reasons), ordered, min(expiries, default=0))
@@ -324,10 +323,6 @@ def _write(
                 arrays[column_name(name)] = array
             rows = pa.table([arrays[name] for name in schema.names], schema=schema)
             writer.write_table(rows, row_group_size=max(1, len(rows)))
-
-
-def _read(scratch: IO[bytes]) -> Any:
-    return pa.ipc.open_stream(scratch).read_all().combine_chunks().to_batches()[0]
 
 
 def _schema(kinds: Mapping[str, str], places: Mapping[str, tuple[int, int]], describe: Describe) -> Any:

@@ -63,15 +63,12 @@ def mine_faults(drive: Drive) -> Mined:
         starts, ends = block.times_us[first], block.times_us[behind - 1]
         longest = int(np.argmax(ends - starts))
         count = float(len(starts))
-        text = f"fault {code:.0f}, {FAULTS.get(int(code), 'unknown')}: reported {_times(len(starts))}"
+        times = "once" if len(starts) == 1 else f"{len(starts)} times"
+        text = f"fault {code:.0f}, {FAULTS.get(int(code), 'unknown')}: reported {times}"
         effect = Estimate(count, count, count, "1")
         start_us, end_us = int(starts[longest]), int(ends[longest])
         events.append(Event(_FAULT, start_us, end_us, drive.vesc or "", (FAULT_FIELD,), text, effect))
     return Mined(events=events)
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
 
 
 # Sensors that are stuck: the cleaning has found where a value stood still while the car moved.
@@ -113,17 +110,13 @@ def _event(drive: Drive, times: list[list[Repair]]) -> Event:
     longest = max((group[0] for group in times), key=lambda repair: repair.end_us - repair.start_us)
     fields = _fields(times[0])
     # It stood from some time after the sample before to some time before the sample after.
-    seconds, step_s = (longest.end_us - longest.start_us) / 1e6, _step_s(drive, longest.stream)
+    seconds = (longest.end_us - longest.start_us) / 1e6
+    step_s = float(np.median(np.diff(drive.streams[longest.stream].times_us))) / 1e6
     effect = Estimate(seconds, seconds, seconds + 2 * step_s, "s")
     text = f"the value of {' and '.join(fields)} stayed the same for {seconds:.3g} s while the car moved"
     if len(times) > 1:
         text += f", the longest of {len(times)} times"
     return Event(_STUCK, longest.start_us, longest.end_us, longest.stream, fields, text, effect)
-
-
-def _step_s(drive: Drive, stream: str) -> float:
-    """The usual time between two samples of a stream."""
-    return float(np.median(np.diff(drive.streams[stream].times_us))) / 1e6
 
 
 # An intermittent link to the motor controller: its samples are missing, or the last one comes again.

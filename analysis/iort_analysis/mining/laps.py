@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -174,20 +174,14 @@ def _energy_wh(drive: Drive, bounds: Array) -> Array:
     seconds, watts = drive.seconds, (volts * amps).astype(np.float64)
     elapsed, mean = np.diff(seconds), (watts[1:] + watts[:-1]) / 2
     known = (elapsed <= _LONGEST_GAP_S) & np.isfinite(mean)
-    between = _summed(seconds, bounds)
+
+    def between(steps: Array) -> Array:
+        """The sum of steps between samples over each lap."""
+        return np.diff(np.interp(bounds, seconds, np.append(0.0, np.cumsum(steps))))
+
     covered = between(np.where(known, elapsed, 0.0)) / np.diff(bounds)
     energy = between(np.where(known, mean * elapsed, 0.0) / 3600)
     return np.where(covered >= _LEAST_COVERED, energy, np.nan)
-
-
-def _summed(seconds: Array, bounds: Array) -> Callable[[Array], Array]:
-    """What sums steps between samples over each lap."""
-
-    def between(steps: Array) -> Array:
-        total = np.concatenate([[0.0], np.cumsum(steps)])
-        return np.diff(np.interp(bounds, seconds, total))
-
-    return between
 
 
 def speed_mps(drive: Drive, laps: Laps) -> Array:
@@ -220,7 +214,8 @@ def mine(drive: Drive) -> Mined:
     if isinstance(found, str):
         return Mined(missing=dict.fromkeys(_NAMES, f"no laps: {found}"))
     estimates, speed = dict(_estimates(found)), speed_mps(drive, found)
-    spread = _spread(found)
+    times = found.time_s[found.complete]
+    spread = f"{len(times)} of {times.min():.1f} s to {times.max():.1f} s"
     # A mean that may as well be below zero is none: such laps differ as much as ways that are no laps.
     unsure = [name for name in _POSITIVE if name in estimates and estimates[name].low <= 0]
     if unsure:
@@ -238,11 +233,6 @@ def mine(drive: Drive) -> Mined:
         missing,
         tables={LAPS_TABLE: _laps_table(found, speed), PLACES_TABLE: _places_table(found, speed)},
     )
-
-
-def _spread(laps: Laps) -> str:
-    times = laps.time_s[laps.complete]
-    return f"{len(times)} of {times.min():.1f} s to {times.max():.1f} s"
 
 
 def _estimates(laps: Laps) -> Iterator[tuple[str, Estimate]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from iort_analysis import NoResultError
 from iort_analysis.drives.drive import Drive
-from iort_analysis.statistics.signals import Array, summed
+from iort_analysis.statistics.signals import Array, bridged, summed
 
 # Fields of any stream that tell the car's turns.
 _TURNS = ("steering_angle", "angular_velocity.z", "angular.z", "gyro_z", "data")
@@ -91,12 +91,7 @@ def _signals(drive: Drive) -> list[Array]:
         column for name, column in drive.samples.columns.items() if name.partition(".")[2].endswith(_TURNS)
     ]
     known = [column for column in (*named, *turns) if column is not None and np.isfinite(column).any()]
-    return [_filled(column.astype(np.float64)) for column in known]
-
-
-def _filled(column: Array) -> Array:
-    finite = np.isfinite(column)
-    return np.interp(np.arange(len(column)), np.flatnonzero(finite), column[finite])
+    return [bridged(column.astype(np.float64)) for column in known]
 
 
 def _period(waves: Array, shortest: int, longest: int) -> tuple[int, float]:

@@ -25,8 +25,7 @@ from iort_contract.messages.batch import (
     Envelope,
     batch_id,
     decode_batch,
-    decode_opened,
-    open_envelope,
+    decode_envelope,
     read_envelope,
 )
 from iort_contract.tables import BATCH, NONFINITE, SAMPLES
@@ -292,11 +291,10 @@ def _by_contract(
     batches: list[Batch] = []
     for envelope in envelopes:
         try:
-            opened = open_envelope(envelope)
-            if messages or (opened.serialized is None and not opened.about):
-                batches.append(decode_opened(opened))
+            if messages or not (envelope.serialized or envelope.about):
+                batches.append(decode_envelope(envelope))
         except ContractError as error:  # noqa: PERF203 - each batch is refused by itself
-            refused.add(error, BatchId(envelope.first_us, envelope.boot, envelope.seq))
+            refused.add(error, envelope.id)
     for _, same in groupby(batches, key=lambda batch: list(batch.columns)):
         group = list(same)
         columns = {

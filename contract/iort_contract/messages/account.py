@@ -10,6 +10,7 @@ import json
 from dataclasses import dataclass
 from typing import Mapping, NamedTuple, Union
 
+from iort_contract.checks import COMPACT
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.envelope import read
 
@@ -54,7 +55,7 @@ class SourceAccount(NamedTuple):
         """The account as a sample; causes that do not fit are added up."""
         counts = dict(sorted(self.counts.items(), key=lambda count: -count[1]))
         rest = 0
-        while len(text := _json({**counts, **({"others": rest} if rest else {})})) > _MAX_TEXT:
+        while len(text := COMPACT.encode({**counts, **({"others": rest} if rest else {})})) > _MAX_TEXT:
             rest += counts.pop(next(reversed(list(counts))))
         return {"source": self.source[:_MAX_TEXT], "counts": text}
 
@@ -99,7 +100,3 @@ def lost(counts: Mapping[str, int]) -> dict[str, int]:
     """A source's counts of unrecorded messages."""
     parts = {path: path.split(".") for path in counts}
     return {path: counts[path] for path, of in parts.items() if counts[path] and not LOST.isdisjoint(of)}
-
-
-def _json(counts: Mapping[str, int]) -> str:
-    return json.dumps(counts, separators=(",", ":"))

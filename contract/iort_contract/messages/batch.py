@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate
 from typing import Any, Mapping, NamedTuple, Sequence
@@ -240,22 +240,23 @@ class Envelope(NamedTuple):
     text: bytes
     behind: bytes
 
+    @property
+    def id(self) -> BatchId:
+        """The batch's unique id in its topic."""
+        return BatchId(self.first_us, self.boot, self.seq)
 
-class Opened(NamedTuple):
-    """A batch whose envelope, times and field names are checked, and whose values are still encoded.
+    @property
+    def serialized(self) -> bool:
+        """Whether the samples are ROS messages that were stored unchanged."""
+        return self.codec == SERIALIZED_CODEC
 
-    ``written`` holds each column as `iort_contract.codec.unpacked` reads it. ``serialized`` holds ROS
-    messages that were stored unchanged; ``about`` describes messages that became columns.
-    """
-
-    boot: str
-    seq: int
-    times_us: list[int]
-    nonfinite: int
-    written: Mapping[str, Any]
-    serialized: bytes | None
-    about: str
-    previous: tuple[RunEnd, ...] | None
+    @property
+    def about(self) -> str:
+        """The description of ROS messages that became columns; raises `ContractError`."""
+        try:
+            return "" if self.serialized else self.behind.decode()
+        except UnicodeDecodeError as error:
+            raise ContractError(f"data after the columns must be text: {error}") from error
 
 
 def read_envelope(message: bytes | str | Mapping[str, Any]) -> Envelope:
@@ -276,17 +277,12 @@ def read_envelope(message: bytes | str | Mapping[str, Any]) -> Envelope:
     return Envelope(boot, seq, first_us, n, nonfinite, previous, codec, text, behind)
 
 
-def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
-    """Check everything in a batch except the values, which take the most time.
+def open_envelope(envelope: Envelope) -> tuple[list[int], Mapping[str, Any]]:
+    """The times of an envelope's samples, and the columns as `iort_contract.codec.unpacked` reads them.
 
-    Raises `ContractError`, with the reason.
+    Checks everything except the values, which take the most time; raises `ContractError`, with the reason.
     """
-    return open_envelope(read_envelope(message))
-
-
-def open_envelope(envelope: Envelope) -> Opened:
-    """Check everything in an envelope's samples except the values; raises `ContractError`."""
-    boot, seq, first_us, n, nonfinite, previous, codec, text, behind = envelope
+    _, _, first_us, n, _, _, _, text, _ = envelope
     check_effort(text)
     body = json_object(text, "samples")
     dt, fields = body.get("dt"), body.get("fields")
@@ -302,9 +298,9 @@ def open_envelope(envelope: Envelope) -> Opened:
     check_times(times)
     for name in fields:
         check_field(name)
-    if codec == SERIALIZED_CODEC:
-        return Opened(boot, seq, times, nonfinite, fields, behind, "", previous)
-    return Opened(boot, seq, times, nonfinite, fields, None, _text(behind), previous)
+    # It must be text, where it is no messages.
+    _ = envelope.about
+    return times, fields
 
 
 def decode_batch(message: bytes | str | Mapping[str, Any]) -> Batch:
@@ -313,21 +309,22 @@ def decode_batch(message: bytes | str | Mapping[str, Any]) -> Batch:
     Messages stored as columns stay columns; `messages_of` rebuilds them. Raises `ContractError`, with the
     reason, for everything that `encode_batch` cannot have written.
     """
-    return decode_opened(open_batch(message))
+    return decode_envelope(read_envelope(message))
 
 
-def decode_opened(opened: Opened) -> Batch:
-    """Decode the values; raises `ContractError`."""
-    boot, seq, times, nonfinite, written, serialized, _, previous = opened
+def decode_envelope(envelope: Envelope) -> Batch:
+    """Decode the samples; raises `ContractError`."""
+    times, fields = open_envelope(envelope)
     n = len(times)
-    columns: dict[str, Sequence[Value]] = {
-        name: unpacked(name, column, n) for name, column in written.items()
-    }
-    if serialized is None:
-        return Batch(boot, seq, times, columns, nonfinite, None, previous)
-    messages = unpack(serialized, n)
+    columns: dict[str, Sequence[Value]] = {name: unpacked(name, column, n) for name, column in fields.items()}
+    batch = Batch(envelope.boot, envelope.seq, times, columns, envelope.nonfinite, None, envelope.previous)
+    if not envelope.serialized:
+        return batch
+    messages = unpack(envelope.behind, n)
     viewed, nulled = view(messages)
-    return Batch(boot, seq, times, {**viewed, **columns}, nonfinite + nulled, messages, previous)
+    return replace(
+        batch, columns={**viewed, **columns}, nonfinite=envelope.nonfinite + nulled, messages=messages
+    )
 
 
 def messages_of(
@@ -338,18 +335,11 @@ def messages_of(
     ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode_batch` does, and for an
     unknown type.
     """
-    opened = open_batch(message)
-    batch = decode_opened(opened)
-    if not opened.about:
+    envelope = read_envelope(message)
+    batch = decode_envelope(envelope)
+    if not envelope.about:
         return batch, batch.messages
-    return batch, from_columns(batch.columns, opened.about, batch.times_us, layouts)
-
-
-def _text(behind: bytes) -> str:
-    try:
-        return behind.decode()
-    except UnicodeDecodeError as error:
-        raise ContractError(f"data after the columns must be text: {error}") from error
+    return batch, from_columns(batch.columns, envelope.about, batch.times_us, layouts)
 
 
 def _check_values(samples: int, fields: int) -> None:
