@@ -196,7 +196,7 @@ def metrics() -> Iterator[Row]:
     """The metrics of the functions."""
     for metric in METRICS.values():
         alarm = "yes" if metric.alarm else ""
-        yield f"`{metric.name}`", metric.function, metric.unit, metric.statistic, metric.chart.title, alarm
+        yield f"`{metric.name}`", metric.function, metric.unit, metric.statistic, metric.chart, alarm
 
 
 @table("alarm", "what happened", "goes off", "what to do")

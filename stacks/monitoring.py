@@ -177,7 +177,7 @@ class Dashboards(Construct):
         )
 
     def _chart(self, chart: Chart) -> cloudwatch.GraphWidget:
-        return _graph(chart.title, self._ours(chart, right=False), self._ours(chart, right=True))
+        return _graph(chart, self._ours(chart, right=False), self._ours(chart, right=True))
 
     def _ours(self, chart: Chart, *, right: bool) -> list[cloudwatch.IMetric]:
         shown = [one for one in METRICS.values() if one.chart == chart and one.right == right]
@@ -200,7 +200,7 @@ class Dashboards(Construct):
 
     def _queues(self, watched: Watched) -> cloudwatch.GraphWidget:
         waiting = [metrics.waiting(queue, label=label) for label, queue in watched.queues.items()]
-        return _graph(QUEUES_CHART.title, waiting, self._ours(QUEUES_CHART, right=True))
+        return _graph(QUEUES_CHART, waiting, self._ours(QUEUES_CHART, right=True))
 
 
 def _warnings(watched: Watched) -> cloudwatch.LogQueryWidget:

@@ -19,29 +19,24 @@ METRIC_DEPLOYMENT, METRIC_FUNCTION = "Deployment", "Function"
 METRIC_ROBOT = "Robot"
 
 
-@dataclass(frozen=True)
-class Chart:
-    """A chart of a dashboard: it shows the metrics that name it."""
-
-    title: str
-
-
-QUEUES_CHART = Chart("Queues: messages waiting")
-LIVE_CHART = Chart("PubNub: live samples published")
-REPORTS_CHART = Chart("Agents: reports a minute, six from each")
-BATCHES_CHART = Chart("Samples and batches a minute")
-GAPS_CHART = Chart("Gaps: holes between samples, missing and refused batches")
-BACKLOG_CHART = Chart("Backlog: batches waiting in the fullest car")
-HOPS_CHART = Chart("Delay of live samples by hop, p95 ms")
-ROUND_TRIPS_CHART = Chart("Round trips of the cars' pings, p95 ms")
-BATTERY_CHART = Chart("Battery of the weakest car, V")
-TEMPERATURE_CHART = Chart("Temperature of the hottest controller, degC")
-FAULTS_CHART = Chart("Samples with a fault code, and alerts sent")
-PRESENCE_CHART = Chart("Robots: who comes and goes")
-ADMISSION_CHART = Chart("Robots: admitted and refused, and pongs sent")
-FILES_CHART = Chart("Robots: files")
-ARCHIVE_CHART = Chart("Archive: hours a minute, and what is overdue or was put off")
-ASKS_CHART = Chart("Robots: questions, and the time of an answer, p95 ms")
+# The title of a dashboard's chart, which shows the metrics that name it.
+Chart = str
+QUEUES_CHART = "Queues: messages waiting"
+LIVE_CHART = "PubNub: live samples published"
+REPORTS_CHART = "Agents: reports a minute, six from each"
+BATCHES_CHART = "Samples and batches a minute"
+GAPS_CHART = "Gaps: holes between samples, missing and refused batches"
+BACKLOG_CHART = "Backlog: batches waiting in the fullest car"
+HOPS_CHART = "Delay of live samples by hop, p95 ms"
+ROUND_TRIPS_CHART = "Round trips of the cars' pings, p95 ms"
+BATTERY_CHART = "Battery of the weakest car, V"
+TEMPERATURE_CHART = "Temperature of the hottest controller, degC"
+FAULTS_CHART = "Samples with a fault code, and alerts sent"
+PRESENCE_CHART = "Robots: who comes and goes"
+ADMISSION_CHART = "Robots: admitted and refused, and pongs sent"
+FILES_CHART = "Robots: files"
+ARCHIVE_CHART = "Archive: hours a minute, and what is overdue or was put off"
+ASKS_CHART = "Robots: questions, and the time of an answer, p95 ms"
 # What the robots ask of the cloud, and what it does by itself: the rows of the services' dashboard.
 SERVICE_CHARTS: tuple[tuple[Chart, ...], ...] = (
     (PRESENCE_CHART, ADMISSION_CHART),
