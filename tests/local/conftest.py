@@ -10,11 +10,11 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pubnub.pubnub import PubNub
 from typer.testing import CliRunner
 
 from iort_station import data
@@ -24,10 +24,8 @@ from iort_station.fleet import robots
 from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from local.pubnub import PubNubStandIn
 from testkit.ports import free_port
 from testkit.waiting import until
-from tests.local.pubnub.pubnub_sdk import sdk
 
 
 @pytest.fixture(scope="session")
@@ -65,19 +63,31 @@ def bundle(
 def iort(embedded: EmbeddedCloud) -> Callable[..., Any]:
     """The operator's command: `iort("robots", "list")`."""
 
-    def run(*arguments: str) -> Any:
-        where = ["--local", "--embedded", str(embedded.folder / EMBEDDED.name)]
-        return CliRunner().invoke(app, [*where, *arguments])
-
-    return run
+    return partial(invoke, embedded.folder)
 
 
-def run_agent(bundle: robots.Bundle, *, timeout_s: float = 300) -> dict[str, Any]:
+def invoke(folder: Path, *arguments: str) -> Any:
+    """The operator's command for the cloud that a folder describes."""
+    where = ["--local", "--embedded", str(folder / EMBEDDED.name)]
+    return CliRunner().invoke(app, [*where, *arguments])
+
+
+AGENT = Path(sys.executable).parent / "iort-agent"
+
+
+def command(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run the installed agent's command to its end, with that exit status."""
+    done = subprocess.run(
+        [AGENT, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == status, done.stdout + done.stderr
+    return done
+
+
+def run_agent(bundle: robots.Bundle) -> dict[str, Any]:
     """Run the installed agent to the end of its sources; return its report."""
     report = bundle.folder / "report.json"
-    command = [Path(sys.executable).parent / "iort-agent", "--config", bundle.config, "--report", report]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
-    assert done.returncode == 0, done.stderr
+    command("--config", bundle.config, "--report", report)
     written: dict[str, Any] = json.loads(report.read_text())
     return written
 
@@ -103,24 +113,3 @@ def recorded(embedded: EmbeddedCloud, robot: str, stream: str) -> data.Result:
     """The stream's samples, as soon as there are some: a query of an unknown stream is an error."""
     until(lambda: list(audit.batches(embedded.cloud, robot, stream)))
     return data.query(embedded.cloud, robot, stream, "-1h", "now")
-
-
-@pytest.fixture
-def standin() -> Iterator[PubNubStandIn]:
-    """PubNub's stand-in, with keys."""
-    with PubNubStandIn(publish_key="pub", subscribe_key="sub") as standin:
-        yield standin
-
-
-@pytest.fixture
-def client() -> Iterator[Callable[..., PubNub]]:
-    """Make PubNub SDK clients by `client(standin, uuid="page")`; stop them before the server stops."""
-    made: list[PubNub] = []
-
-    def make(standin: PubNubStandIn, **given: Any) -> PubNub:
-        made.append(sdk(standin, **given))
-        return made[-1]
-
-    yield make
-    for pubnub in made:
-        pubnub.stop()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import threading
 import time
 from collections import defaultdict
@@ -66,25 +65,6 @@ def close_alarm_state() -> None:
     Patch: none; a patch would have to know every value of TreatMissingData, where ours know one
     """
     cloudwatch._evaluate_alarm = partial(evaluate, since_s=time.time())
-
-
-def alarm_state_is_open() -> bool:
-    """Evaluate an alarm whose metric has data under other dimensions only."""
-    record("gaps", "AlarmState", 1, "Count", Deployment="other")
-    alarm = {
-        "AlarmName": "gaps-alarm-state",
-        "Namespace": "gaps",
-        "MetricName": "AlarmState",
-        "Dimensions": [{"Name": "Deployment", "Value": "own"}],
-        "Statistic": "Sum",
-        "Period": 60,
-        "Threshold": 0,
-        "ComparisonOperator": "GreaterThanThreshold",
-        "StateValue": "OK",
-        "AlarmActions": [],
-    }
-    cloudwatch._evaluate_alarm(alarm)
-    return alarm["StateValue"] != "OK"
 
 
 def evaluate(alarm: dict[str, Any], *, since_s: float = 0.0) -> None:
@@ -151,12 +131,6 @@ def close_alarm_timer() -> None:
     Patch: none; ministack has no clock of its own
     """
     # `start` closes the gap once the emulator is configured.
-
-
-def alarm_timer_is_open() -> bool:
-    """Look at the source for a thread or a timer: no wait shows that nobody looks."""
-    source = inspect.getsource(cloudwatch)
-    return not any(word in source for word in ("Thread(", "create_task(", "call_later(", "Timer("))
 
 
 def start(region: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import ssl
 from collections.abc import Awaitable, Callable, Iterable, Iterator
@@ -27,11 +26,6 @@ def close_client_certificate() -> None:
     Patch: none; ministack serves such clients on purpose, so upstream would have to agree on a switch first
     """
     iot._mtls_serve_conn = _for_a_certificate(iot._mtls_serve_conn)
-
-
-def client_certificate_is_open() -> bool:
-    """Ask who a client without a certificate is."""
-    return iot._mtls_resolve_identity(None) is not None
 
 
 def _for_a_certificate(serve: Callable[..., Any]) -> Callable[..., Any]:
@@ -62,11 +56,6 @@ def close_delivery_time() -> None:
     """
     iot._subscriptions = Subscriptions()
     iot.broker_publish = asking(iot.broker_publish)
-
-
-def delivery_time_is_open() -> bool:
-    """Look whether the subscriptions are a plain dictionary."""
-    return type(iot._subscriptions) is dict
 
 
 @dataclass
@@ -152,11 +141,6 @@ def close_https_port() -> None:
     app._port_is_bindable = lambda _host, _port: False
 
 
-def https_port_is_open() -> bool:
-    """Look at the source: the port is taken in the middle of `main`, which serves for ever."""
-    return "_port_is_bindable(bind_host, 443)" in inspect.getsource(app.main)
-
-
 _REMEMBERED = 1_024
 OF_THE_SQL_ALONE = (
     "_rule_topic_filter",
@@ -181,11 +165,6 @@ def close_rule_time() -> None:
         setattr(iot, name, lru_cache(_REMEMBERED)(getattr(iot, name)))
 
 
-def rule_time_is_open() -> bool:
-    """Look whether a rule's topic is remembered."""
-    return not hasattr(iot._rule_topic_filter, "cache_info")
-
-
 # The file with the private key, the certificate and its authority's.
 VARIABLE = "IORT_BROKER_CERTIFICATE"
 
@@ -204,11 +183,6 @@ def close_server_certificate() -> None:
         file = Path(os.environ[VARIABLE])
         iot._mtls_ensure_server_cert = lambda: (file.read_text(), "")
         iot._mtls_context = _following(iot._mtls_context, file)
-
-
-def server_certificate_is_open() -> bool:
-    """Ask whether a certificate of one's own can be named."""
-    return "environ" not in inspect.getsource(iot._mtls_ensure_server_cert)
 
 
 def _following(

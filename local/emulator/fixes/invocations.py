@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 import os
 import queue
@@ -11,9 +10,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from functools import wraps
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import patch
 
 from ministack.core import lambda_runtime
 from ministack.services import cloudwatch_logs, iot, lambda_svc
@@ -70,31 +67,6 @@ def close_async_invocations() -> None:
     Patch: none; it needs a queue for each function, which is more than a small patch
     """
     iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch
-
-
-def async_invocations_is_open() -> bool:
-    """Send one event to a function that is throttled, and count the attempts."""
-    attempts = []
-
-    def throttled(_record: Any, event: Any) -> dict[str, Any]:
-        attempts.append(event)
-        return {"error": True, "throttle": True}
-
-    def thread(*, target: Any, args: Any, daemon: bool) -> SimpleNamespace:
-        return SimpleNamespace(start=lambda: target(*args), daemon=daemon)
-
-    function = {"config": {"FunctionName": "function"}}
-    with (
-        patch.object(iot, "threading", SimpleNamespace(Thread=thread)),
-        patch.multiple(
-            lambda_svc,
-            _get_func_record_for_ref_in_scope=lambda *_, **__: (function, function["config"], "function"),
-            _execution_record_for_config=lambda record, _config: record,
-            _execute_function_with_config_scope=throttled,
-        ),
-    ):
-        iot._dispatch_rule_to_lambda("000000000000", "eu-west-1", "arn:function", {})
-    return len(attempts) == 1
 
 
 class AsyncInvocations:
@@ -199,11 +171,6 @@ def close_log_end() -> None:
     lambda_runtime.Worker._drain_stderr_bounded = _to_the_end(drain)
 
 
-def log_end_is_open() -> bool:
-    """Look at the parameters: the 50 ms are one, and a test must not measure them."""
-    return "first_line_wait" in inspect.signature(lambda_runtime.Worker._drain_stderr_bounded).parameters
-
-
 def _to_the_end(drain: Callable[..., str]) -> Callable[[Any], str]:
     def log(worker: Any) -> str:
         if not str(worker.config.get("Runtime", "")).startswith("python"):
@@ -240,11 +207,6 @@ def close_log_retention() -> None:
     Patch: none; which logs are worth their memory is not for ministack to say
     """
     lambda_svc._emit_lambda_logs = _forgetting(lambda_svc._emit_lambda_logs)
-
-
-def log_retention_is_open() -> bool:
-    """Look at the source: no number of invocations shows that none is ever forgotten."""
-    return "retentionInDays" not in inspect.getsource(cloudwatch_logs._append_log_events)
 
 
 def _forgetting(emit: Callable[..., None]) -> Callable[..., None]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import inspect
 import json
 import re
 import time
@@ -11,9 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import Any
-from unittest.mock import patch
 
-from ministack.core.responses import request_scope
 from ministack.services import cloudwatch, iot, lambda_svc, sqs
 
 from local.emulator.fixes import alarms
@@ -31,23 +27,6 @@ def close_embedded_metrics() -> None:
       line
     """
     lambda_svc._execute_function_dispatch = _reading_logs(lambda_svc._execute_function_dispatch)
-
-
-def embedded_metrics_is_open() -> bool:
-    """Run a function that logs a metric, in an account of its own, and look for the metric."""
-    directive = {"Namespace": "gaps", "Dimensions": [[]], "Metrics": [{"Name": "Embedded"}]}
-    line = json.dumps({"_aws": {"Timestamp": 0, "CloudWatchMetrics": [directive]}, "Embedded": 1})
-    function = {"config": {"FunctionName": "gaps-embedded-metrics"}}
-    with (
-        request_scope("000000000001", "eu-west-1"),
-        patch.multiple(
-            lambda_svc,
-            _proxy_url_for=lambda _config: "http://nowhere",
-            _execute_function_proxy=lambda *_: {"body": None, "log": line},
-        ),
-    ):
-        lambda_svc._execute_function_dispatch(function, function["config"], {}, "id", time.time())
-        return ("gaps", "Embedded", "") not in cloudwatch._metrics
 
 
 def _reading_logs(dispatch: Callable[..., Any]) -> Callable[..., Any]:
@@ -101,13 +80,6 @@ def close_iot_metrics() -> None:
     iot._run_rule_actions = _counting_matches(iot._run_rule_actions)
     iot._dispatch_rule_action = _counting_actions(iot._dispatch_rule_action)
     iot.broker_publish = _counting_messages(iot.broker_publish)
-
-
-def iot_metrics_is_open() -> bool:
-    """Run a rule, and look for its metric."""
-    rule = {"ruleName": "gaps_iot_metrics", "sql": "SELECT * FROM 'a'", "actions": []}
-    asyncio.run(iot._run_rule_actions("000000000000", "eu-west-1", rule, b"{}", "a"))
-    return ("AWS/IoT", "TopicMatch", "RuleName=gaps_iot_metrics") not in cloudwatch._metrics
 
 
 def _counting_matches(run_rule_actions: Callable[..., Any]) -> Callable[..., Any]:
@@ -171,19 +143,6 @@ def close_lambda_metrics() -> None:
     lambda_svc._emit_lambda_metrics = _count_throttles
 
 
-def lambda_metrics_is_open() -> bool:
-    """Run a function that a proxy would run, and look for its metric."""
-    function = {"config": {"FunctionName": "gaps-lambda-metrics"}}
-    with patch.multiple(
-        lambda_svc,
-        _proxy_url_for=lambda _config: "http://nowhere",
-        _execute_function_proxy=lambda *_: {"body": None},
-        _emit_lambda_logs=lambda *_, **__: None,
-    ):
-        lambda_svc._execute_function_dispatch(function, function["config"], {}, "id", time.time())
-    return ("AWS/Lambda", "Invocations", "FunctionName=gaps-lambda-metrics") not in cloudwatch._metrics
-
-
 def counting_invocations(dispatch: Callable[..., Any]) -> Callable[..., Any]:
     """An execution of a function that is counted."""
 
@@ -238,11 +197,6 @@ def close_queue_metrics() -> None:
     alarms.BEFORE_ALARMS.append(count)
 
 
-def queue_metrics_is_open() -> bool:
-    """Look at the source: no wait shows that nobody counts."""
-    return not any('"AWS/SQS", "Approx' in inspect.getsource(module) for module in (sqs, cloudwatch))
-
-
 def count() -> None:
     """Record how many messages wait in each queue."""
     for queue in list(sqs._queues.values()):
@@ -267,13 +221,6 @@ def close_metric_search() -> None:
     Patch: none; only the form of SEARCH that our dashboards use is understood here
     """
     cloudwatch._get_metric_data = _searching(cloudwatch._get_metric_data)
-
-
-def metric_search_is_open() -> bool:
-    """Search for a metric that nobody records."""
-    search = "SEARCH('{AWS/IoT,RuleName} MetricName=\"Failure\"', 'Sum', 60)"
-    request = {"MetricDataQueries": [{"Id": "a", "Expression": search}]}
-    return b"not implemented" in cloudwatch._get_metric_data({}, request, is_cbor=False, is_json=True)[2]
 
 
 def _searching(get_metric_data: Callable[..., Any]) -> Callable[..., Any]:

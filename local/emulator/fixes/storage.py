@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
@@ -11,7 +10,6 @@ from datetime import datetime
 from functools import wraps
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock, patch
 
 from ministack import app
 from ministack.core import iam_actions
@@ -43,11 +41,6 @@ def close_object_expiry() -> None:
         (_PROPERTY, _rules, s3._bucket_lifecycle.__setitem__, s3._bucket_lifecycle.pop),
     )
     alarms.BEFORE_ALARMS.append(_look)
-
-
-def object_expiry_is_open() -> bool:
-    """Look at the properties of a bucket that a template may set."""
-    return not any(one[0] == _PROPERTY for one in provisioners._S3_BUCKET_CONFIGURATIONS)
 
 
 def expire(now_s: float) -> None:
@@ -111,7 +104,6 @@ def _seconds(text: str) -> float:
     return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp()
 
 
-_BODY = b'{"TableName": "gaps-request-time"}'
 # The items that the running BatchWriteItem has found good, by their identity.
 _GOOD: ContextVar[dict[int, Any] | None] = ContextVar("good", default=None)
 
@@ -159,15 +151,6 @@ def close_request_time() -> None:
     dynamodb._batch_write_item = _checking_once(dynamodb._batch_write_item)
     dynamodb._validate_item = _once(dynamodb._validate_item)
     dynamodb._accumulate_write_capacity = _unless_batch(dynamodb._accumulate_write_capacity)
-
-
-def request_time_is_open() -> bool:
-    """Read a request twice as the policy check does, and count how often it is parsed."""
-    loads = Mock(side_effect=json.loads)
-    with patch.object(iam_actions, "json", _reading(loads)):
-        iam_actions.dynamodb_service_context(_BODY)
-        iam_actions.dynamodb_resource_arns(_BODY, "eu-west-1", "000000000000")
-    return loads.call_count > 1
 
 
 def _reading(loads: Callable[..., Any]) -> SimpleNamespace:
@@ -230,13 +213,6 @@ def close_own_paths() -> None:
     Patch: none; ministack's own users want these addresses
     """
     app.app = _refusing(app.app)
-
-
-def own_paths_is_open() -> bool:
-    """Ask for the messages of all queues."""
-    messages = "/_ministack/sqs/messages"
-    status, *_ = asyncio.run(app._handle_sqs_messages_request("GET", messages, {}, {}))
-    return bool(status == 200)
 
 
 def _refusing(serve: Serve) -> Serve:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import logging
 import os
@@ -47,11 +46,6 @@ def close_stream_retries() -> None:
     """
     # The emulator keeps its streams in the ledger, which is installed before.
     lambda_svc._poll_dynamodb_streams = StreamMappings(dynamodb._stream_records).poll
-
-
-def stream_retries_is_open() -> bool:
-    """Look at the source: no finite number of attempts shows that a batch is tried for ever."""
-    return "Bisect" not in inspect.getsource(lambda_svc._poll_dynamodb_streams)
 
 
 @dataclass

@@ -8,9 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from decimal import InvalidOperation
 from functools import lru_cache, wraps
 from typing import Any, NamedTuple
-from unittest.mock import Mock, patch
 
-from ministack.core.responses import request_scope
 from ministack.services import dynamodb
 
 from local.persistence.items import PAGE_BYTES, SHOWN, Bound, Bucket, Item, Items, Shown, Wanted, place_of
@@ -48,30 +46,6 @@ def close_query_time() -> None:
     dynamodb._scan = narrowing(dynamodb._scan, scanned)
     dynamodb._apply_exclusive_start_key_scan = continuing(dynamodb._apply_exclusive_start_key_scan)
     dynamodb._evaluate_condition = evaluating(dynamodb._evaluate_condition)
-
-
-def query_time_is_open() -> bool:
-    """Ask for one of ten items, and count how many are looked at."""
-    name, key = "gaps-query-time", [("p", "HASH", "S"), ("t", "RANGE", "N")]
-    with request_scope("000000000000", "eu-west-1"):
-        dynamodb._create_table(
-            {
-                "TableName": name,
-                "KeySchema": [{"AttributeName": n, "KeyType": k} for n, k, _ in key],
-                "AttributeDefinitions": [{"AttributeName": n, "AttributeType": t} for n, _, t in key],
-                "BillingMode": "PAY_PER_REQUEST",
-            }
-        )
-        try:
-            for n in range(10):
-                dynamodb._put_item({"TableName": name, "Item": {"p": {"S": "p"}, "t": {"N": str(n)}}})
-            condition = {"KeyConditionExpression": "p = :p", "ExpressionAttributeValues": {":p": {"S": "p"}}}
-            evaluate = Mock(side_effect=dynamodb._evaluate_condition)
-            with patch.object(dynamodb, "_evaluate_condition", evaluate):
-                dynamodb._query({"TableName": name, "Limit": 1, **condition})
-            return evaluate.call_count >= 10
-        finally:
-            dynamodb._delete_table({"TableName": name})
 
 
 class Found(NamedTuple):
@@ -253,14 +227,6 @@ def close_number_checks() -> None:
     dynamodb._number_size_bytes = lru_cache(_REMEMBERED_NUMBERS)(dynamodb._number_size_bytes)
     dynamodb._ddb_canonicalize_number = plainly(dynamodb._ddb_canonicalize_number, lambda text: text)
     dynamodb._number_error = plainly(dynamodb._number_error, lambda _: None)
-
-
-def number_checks_is_open() -> bool:
-    """Read a plain number, and look whether it is taken apart."""
-    decimal = Mock(side_effect=dynamodb.Decimal)
-    with patch.object(dynamodb, "Decimal", decimal):
-        dynamodb._ddb_canonicalize_number("1.5")
-    return bool(decimal.called)
 
 
 def plainly(look: Callable[[Any], Any], answer: Callable[[str], Any]) -> Callable[[Any], Any]:

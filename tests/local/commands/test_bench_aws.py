@@ -10,25 +10,12 @@ import pytest
 from botocore.exceptions import ClientError
 
 from bench import run
-from iort_station.fleet import identity, robots
+from iort_station.fleet import robots
 from testkit.target import AWS, open_target
 
 
 def options(tmp_path, *only: str, yes: bool):
     return argparse.Namespace(only=list(only), values=[], target=AWS, namespace="iort", yes=yes, out=tmp_path)
-
-
-def test_each_run_has_its_own_robots_and_removes_them(embedded):
-    iot, made = embedded.cloud.client("iot"), []
-    for _ in range(2):
-        with open_target(AWS, cloud=embedded.cloud) as target:
-            made.append(target.robot("bench-car").robot)
-            assert iot.describe_thing(thingName=made[-1])["thingName"] == target.name("bench-car")
-            assert identity.certificates(embedded.cloud, made[-1])
-    assert len(set(made)) == 2
-    for name in made:
-        with pytest.raises(ClientError):
-            iot.describe_thing(thingName=name)
 
 
 def test_a_failed_removal_does_not_prevent_the_removal_of_other_robots(embedded):

@@ -52,15 +52,16 @@ def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     ("arguments", "said"),
     [
         (("robots", "add", "car/1"), "got 'car/1'"),
-        (("robots", "remove", "nobody"), "robot nobody is not registered"),
-        (("files", "list", "nobody"), "robot nobody is not registered; "),
-        (("files", "list", "nobody", "--last", "1h", "--json"), "robot nobody is not registered"),
-        (("files", "get", "nobody"), "robot nobody is not registered"),
+        (("config", "car/1"), "got 'car/1'"),
         *(
-            ((*verb, "nobody"), "robot nobody is not registered; ")
-            for verb in (("trace",), ("runs",), ("streams",), ("audit",), ("config",), ("errors", "--robot"))
+            (command.split(), "robot nobody is not registered")
+            for command in (
+                *("trace nobody", "runs nobody", "streams nobody", "audit nobody", "config nobody"),
+                *("errors --robot nobody", "query nobody vesc", "send nobody drive {}"),
+                *("robots remove nobody", "robots show nobody", "robots rotate nobody"),
+                *("files get nobody", "files list nobody", "files list nobody --last 1h --json"),
+            )
         ),
-        (("query", "nobody", "vesc"), "robot nobody is not registered; "),
         (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "with its own keys"),
     ],
 )

@@ -19,7 +19,7 @@ from iort_station.operations import recompute
 from local.demo import DOWNLINK
 from testkit.waiting import until
 from tests.local.conftest import recorded
-from tests.local.robots.test_shadow import driving
+from tests.local.data.drives import Agent
 from tests.manual import COMMANDS, examples
 
 # Commands that need what an embedded cloud does not have, or that change what other tests use.
@@ -68,7 +68,7 @@ def test_every_example_does_what_it_says(embedded, iort, car7, tmp_path, monkeyp
     # It would wait a minute for Lambda 2's cache of parameters.
     monkeypatch.setattr(recompute, "wait_until_settled", lambda: None)
 
-    with driving(car7):
+    with Agent(car7):
         recorded(embedded, "car7", "pose")
         for name in OF_A_DRIVE:
             # PubNub's SDK leaves its sockets to the end of the process.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from hashlib import sha256
@@ -21,18 +19,14 @@ from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
 from iort_contract.messages.files import File, file_key
 from iort_station.data.recorded import topic_of
 from iort_station.operations import audit
-from local.cloud import ROOT
-from testkit.waiting import GUARD_S, until
+from testkit.waiting import until
+from tests.local.conftest import command
+from tests.local.data.drives import Agent
 from tests.local.faults.test_uplink import self_signed, set_status
-
-AGENT = Path(sys.executable).parent / "iort-agent"
 
 
 def findings(config: Path, *, status: int) -> dict[str, dict[str, str]]:
-    done = subprocess.run(
-        [AGENT, "check", "--config", config, "--json"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == status, done.stdout + done.stderr
+    done = command("check", "--config", config, "--json", status=status)
     return {one["what"]: one for one in json.loads(done.stdout)}
 
 
@@ -148,43 +142,23 @@ def test_the_check_reports_a_missing_ros_master(monkeypatch):
 
 def test_a_running_agent_reports_its_status(embedded, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}], metrics={"every_s": 1}, queue={})
-    with subprocess.Popen([AGENT, "run", "--config", car.config], cwd=ROOT) as agent:
-        try:
-            state = until(lambda: _state(car.config))
-            assert state["robot"] == car.robot
-            until(lambda: (now := _state(car.config)) and now["clock"])
-            state = until(lambda: (now := _state(car.config)) and now["streams"]["vesc"]["per_s"] > 0 and now)
-            assert state["connection"]["connected"]
-            # The emulator and the test share one clock.
-            assert abs(state["clock"]["offset_ms"]) <= state["clock"]["uncertainty_ms"] + 1
-            found = findings(car.config, status=0)
-            assert found["broker"]["text"] == "the running agent is connected"
-            state = until(lambda: _state(car.config))
-            assert state["connection"]["connects"] == 1, "check took the connection"
-            shown = subprocess.run(
-                [AGENT, "status", "--config", car.config], capture_output=True, text=True, check=True
-            )
-            assert "connected for" in shown.stdout
-            second = subprocess.run(
-                [AGENT, "--config", car.config], capture_output=True, text=True, check=False, timeout=300
-            )
-            assert second.returncode == 1
-            assert f"in use by another iort-agent (process {agent.pid})" in second.stderr
-            samples = until(lambda: _own_samples(embedded, car.robot))
-        finally:
-            agent.terminate()
-            assert agent.wait(GUARD_S) == 0
+    with Agent(car) as agent:
+        assert agent.told()["robot"] == car.robot
+        until(lambda: agent.told()["clock"])
+        state = until(lambda: (now := agent.told())["streams"]["vesc"]["per_s"] > 0 and now)
+        assert state["connection"]["connected"]
+        # The emulator and the test share one clock.
+        assert abs(state["clock"]["offset_ms"]) <= state["clock"]["uncertainty_ms"] + 1
+        assert findings(car.config, status=0)["broker"]["text"] == "the running agent is connected"
+        assert agent.told()["connection"]["connects"] == 1, "check took the connection"
+        assert "connected for" in command("status", "--config", car.config).stdout
+        second = command("--config", car.config, status=1)
+        assert f"in use by another iort-agent (process {agent.process.pid})" in second.stderr
+        samples = until(lambda: _own_samples(embedded, car.robot))
     assert samples.keys() == AGENT_FIELDS.keys()
     assert samples["connects"][-1] == 1
     assert 1 < samples["rss_mb"][-1] < 200
     assert not (car.folder / "agent.sock").exists()
-
-
-def _state(config: Path) -> Any:
-    done = subprocess.run(
-        [AGENT, "status", "--config", config, "--json"], capture_output=True, text=True, check=False
-    )
-    return json.loads(done.stdout) if done.returncode == 0 else None
 
 
 def _own_samples(embedded: Any, robot: str) -> dict[str, Any] | None:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from botocore.exceptions import ClientError
-from typer.testing import CliRunner
 
 from iort_contract.messages.files import FILES_PREFIX
-from iort_station.cli.main import app
 from iort_station.fleet import identity, registry, robots
 from local.deployment import deploy
 from scripts import destroy
 from testkit.waiting import until
+from tests.local.conftest import invoke
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,7 @@ def destroyed(cloud, noun):
     return False, " ".join(event.get("ResourceStatusReason", "") for event in failed)
 
 
+@pytest.mark.heavy
 def test_a_teardown_leaves_other_deployments_untouched(embedded, bundle, lab, tmp_path):
     cloud, description = lab
     kept = bundle()
@@ -55,9 +56,7 @@ def test_a_teardown_leaves_other_deployments_untouched(embedded, bundle, lab, tm
     bucket = cloud.output("storage", "FilesBucket")
     cloud.client("s3").put_object(Bucket=bucket, Key=f"{FILES_PREFIX}lab-car1/drive.bag", Body=b"drive")
 
-    def iort(*arguments):
-        return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments])
-
+    iort = partial(invoke, description.parent)
     scheduler, deployment = cloud.client("scheduler"), destroy.Deployment(cloud)
 
     def states():

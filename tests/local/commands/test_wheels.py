@@ -16,6 +16,8 @@ from scripts import wheels
 from testkit.waiting import until
 from tests.installed import Installed
 
+# It builds wheels and installs them into two environments.
+pytestmark = pytest.mark.heavy
 RATE_HZ, DRIVE_S = 20, 2
 
 

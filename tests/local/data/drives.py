@@ -9,13 +9,18 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
+from typing_extensions import Self
+
+from iort_agent.errors import AgentError
+from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from testkit.waiting import GUARD_S, until
+from testkit.waiting import until
 
 RATE_HZ = 50
 # The log's column and the contract's field of the counter.
@@ -52,11 +57,10 @@ class Agent:
         environment: dict[str, str] | None = None,
     ) -> None:
         self._report = bundle.folder / "report.json"
-        self._command = [str(Path(sys.executable).parent / "iort-agent")]
-        self._config = ["--config", str(bundle.config)]
-        running = ["run", *self._config, "--report", str(self._report), "--drain-s", str(drain_s)]
+        self._socket = bundle.folder / SOCKET
+        command = [str(Path(sys.executable).parent / "iort-agent"), "run", "--config", str(bundle.config)]
         self.process = subprocess.Popen(
-            [*before, *self._command, *running],
+            [*before, *command, "--report", str(self._report), "--drain-s", str(drain_s)],
             cwd=ROOT,
             env={**os.environ, **(environment or {})},
             stdout=subprocess.DEVNULL,
@@ -66,6 +70,16 @@ class Agent:
         self.log: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End it cleanly, and check that it has."""
+        self.stop()
+        self.report()
 
     def _read(self) -> None:
         assert self.process.stderr is not None
@@ -77,11 +91,11 @@ class Agent:
         return any(text in line for line in self.log)
 
     def status(self) -> dict[str, Any]:
-        """Return the output of `iort-agent status`; empty while no agent answers."""
-        command = [*self._command, "status", *self._config, "--json"]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=GUARD_S)
-        answer: dict[str, Any] = json.loads(done.stdout) if done.returncode == 0 else {}
-        return answer
+        """Return what `iort-agent status` asks for; empty while no agent answers."""
+        try:
+            return fetch(self._socket)
+        except AgentError:
+            return {}
 
     def told(self) -> dict[str, Any]:
         """Return the status as soon as it answers: a busy machine may leave it no time."""

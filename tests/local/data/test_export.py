@@ -23,7 +23,6 @@ from testkit.mqtt import Robot
 from testkit.waiting import until
 from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent
-from tests.local.data.test_query import iort
 from tests.recordings import recording
 
 VESC, SERVO = "/sensors/core", "/sensors/servo_position_command"
@@ -92,7 +91,7 @@ def lab_bag(path: Path) -> Path:
 
 
 @pytest.mark.timeout(300)
-def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, tmp_path):
+def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, iort, tmp_path):
     original, lab = recording("f1tenth-motor-servo.bag"), lab_bag(tmp_path / "lab.bag")
     robot = bundle(
         sources=[
@@ -117,8 +116,8 @@ def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, tmp_path):
     assert report["streams"]["types"]["samples"] == 3
     exported = tmp_path / "again.bag"
     asked = ["export", robot.robot, "vesc", "servo", "lab", "--last", "all", "--out"]
-    done = iort(*asked, str(exported), embedded=embedded)
-    assert done.returncode == 0, done.stderr
+    done = iort(*asked, str(exported))
+    assert done.exit_code == 0, done.output
     assert "2,244 messages of vesc_msgs/VescStateStamped on /sensors/core" in done.stderr
 
     # Messages are equal byte for byte, under the recorded definition, at the time of their stamps if they
@@ -132,8 +131,8 @@ def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, tmp_path):
         assert [t_ns for t_ns, _ in came] == [stamp // 1000 * 1000 for stamp in stamps]
 
     mcap = tmp_path / "again.mcap"
-    done = iort(*asked, str(mcap), embedded=embedded)
-    assert done.returncode == 0, done.stderr
+    done = iort(*asked, str(mcap))
+    assert done.exit_code == 0, done.output
     with mcap.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
@@ -155,12 +154,11 @@ def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, tmp_path):
             shown = [(t_ns, flat(message)) for t_ns, message in foxglove.messages[topic]]
             assert shown == asked_for, (path, topic)
 
-    done = iort(*asked, str(exported), embedded=embedded)
-    assert done.returncode == 1
-    assert "exists" in done.stderr
+    done = iort(*asked, str(exported))
+    assert "exists" in str(done.exception)
 
 
-def test_fields_that_appear_later_are_exported(embedded: Any, bundle: Any, tmp_path: Path) -> None:
+def test_fields_that_appear_later_are_exported(embedded: Any, bundle: Any, iort: Any, tmp_path: Path) -> None:
     car, noise = bundle(), np.random.default_rng(1)
     t_us, n, batches = 1_760_000_000_000_000, 2000, 14
     wide = [{f"x{i}": noise.random(n).tolist() for i in range(4)} for _ in range(batches)]
@@ -173,8 +171,8 @@ def test_fields_that_appear_later_are_exported(embedded: Any, bundle: Any, tmp_p
             assert robot.publish(record_topic(car.robot, "s"), encode_batch(batch)) == "SUCCESS"
     until(lambda: len(list(audit.items(embedded.cloud, car.robot, "s"))) == batches + 1)
     path = tmp_path / "s.bag"
-    done = iort("export", car.robot, "s", "--last", "all", "-o", str(path), embedded=embedded)
-    assert done.returncode == 0, done.stderr
+    done = iort("export", car.robot, "s", "--last", "all", "-o", str(path))
+    assert done.exit_code == 0, done.output
     with AnyReader([path]) as reader:
         *_, (connection, _, raw) = reader.messages()
         assert sum(1 for _ in reader.messages()) == n * batches + 1

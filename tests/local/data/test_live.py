@@ -90,21 +90,16 @@ def test_a_lease_wakes_a_car_and_its_end_lets_it_sleep(cloud, car):
         if update["stream"] == VESC_STREAM and (not heard or update["seq"] > heard[-1]["seq"]):
             heard.append(update)
 
-    with listening(cloud.cloud, cloud.live, robot=asleep.robot, on_update=take):
-        agent = Agent(asleep)
-        try:
-            until(heard.__len__)
-            assert set(periods()) == {_IDLE_MS}
-            with Viewer(cloud.cloud, [asleep.robot], broker=cloud.live == IOT):
-                until(lambda: periods().count(_FULL_MS) >= 20)
-            until(lambda: periods()[-1] == _IDLE_MS)
-            count = len(heard)
-            assert agent.told()["lanes"]["live"]["viewers"] == 0
-            until(lambda: len(heard) > count)
-            assert periods()[count:] == [_IDLE_MS]
-        finally:
-            agent.stop()
-            agent.report()
+    with listening(cloud.cloud, cloud.live, robot=asleep.robot, on_update=take), Agent(asleep) as agent:
+        until(heard.__len__)
+        assert set(periods()) == {_IDLE_MS}
+        with Viewer(cloud.cloud, [asleep.robot], broker=cloud.live == IOT):
+            until(lambda: periods().count(_FULL_MS) >= 20)
+        until(lambda: periods()[-1] == _IDLE_MS)
+        count = len(heard)
+        assert agent.told()["lanes"]["live"]["viewers"] == 0
+        until(lambda: len(heard) > count)
+        assert periods()[count:] == [_IDLE_MS]
 
 
 def test_a_live_message_without_an_envelope_is_never_shown(cloud, car):

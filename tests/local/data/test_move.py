@@ -5,18 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from functions.upload import Bucket, metadata
 from iort_contract.cloud import IOT
@@ -36,7 +32,6 @@ from iort_contract.tables import (
 )
 from iort_contract.tables import ROBOT as ROBOT_KEY
 from iort_station import data
-from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.data import findings
 from iort_station.data.recorded import archive_of, telemetry_table, topic_of
@@ -51,7 +46,8 @@ from local.deployment import ROOT
 from local.network.proxy import REFUSE, Proxy
 from testkit.mqtt import Robot
 from testkit.ports import free_port
-from testkit.waiting import GUARD_S, until
+from testkit.waiting import until
+from tests.local.conftest import command, invoke
 from tests.local.data.drives import Agent
 from tests.local.data.test_archive import HOUR_US, START, stored
 
@@ -94,8 +90,7 @@ def limited(side: EmbeddedCloud, name: str, folder: Path) -> Side:
 
 
 def iort(cloud: EmbeddedCloud | Side, *arguments: str) -> Any:
-    where = ["--local", "--embedded", str(cloud.folder / EMBEDDED.name)]
-    return CliRunner().invoke(app, [*where, *arguments])
+    return invoke(cloud.folder, *arguments)
 
 
 def upload(cloud: Cloud, content: bytes) -> str:
@@ -292,16 +287,6 @@ def audited(side: EmbeddedCloud, robot: str) -> dict[str, Any]:
     return {one["stream"]: one for one in streams}[STREAM]
 
 
-@contextmanager
-def running(car: robots.Bundle, *, drain_s: float = GUARD_S) -> Iterator[Agent]:
-    """The installed agent, killed at the end."""
-    agent = Agent(car, drain_s=drain_s)
-    try:
-        yield agent
-    finally:
-        agent.kill()
-
-
 @pytest.mark.parametrize("way", ["bundle", "claim"])
 def test_a_robot_drives_on_in_the_target_with_its_queue(
     embedded: EmbeddedCloud, other: EmbeddedCloud, tmp_path: Path, way: str
@@ -315,13 +300,11 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
     with Proxy("127.0.0.1", source.mqtt_port) as proxy:
         robots.configure(car, {"port": proxy.port})
         # What is left when it ends stays in the queue.
-        with running(car, drain_s=1) as agent:
+        with Agent(car, drain_s=1) as agent:
             until(lambda: len(list(audit.batches(source, robot, STREAM))) >= 2)
             proxy.mode = REFUSE
             # These stay in the queue on the robot's disk.
             until(lambda: agent.told()["spool"]["batches"] >= 6)
-            agent.stop()
-            agent.process.wait()
     there = {(batch.boot, batch.seq) for batch in audit.batches(source, robot, STREAM)}
     boots = {boot for boot, _ in there}
     if way == "bundle":
@@ -336,13 +319,10 @@ def test_a_robot_drives_on_in_the_target_with_its_queue(
         done = iort(embedded, *move_)
         # The claim's files beside car.yaml, which keeps the robot's own settings.
         claim = identity.claim(target, robot, out=car.folder)
-        command = [Path(sys.executable).parent / "iort-agent", "provision", "--config", claim]
-        subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+        command("provision", "--config", claim)
     assert done.exit_code == 0, done.stdout
-    with running(car) as agent:
+    with Agent(car):
         until(lambda: {batch.boot for batch in audit.batches(target, robot, STREAM)} - boots)
-        agent.stop()
-        agent.report()
     done = iort(embedded, *move_)
     assert done.exit_code == 0, done.stdout
     assert re.search(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import ssl
 import threading
@@ -135,19 +134,3 @@ def test_each_of_ten_thousand_messages_arrives_once(queue):
     assert len(came) == MESSAGES
     assert set(came.values()) == {1}
     assert sqs._get_q(queue)["messages"] == []
-
-
-def test_every_function_that_changes_a_queue_takes_the_lock():
-    """Checks the calls that add and remove this project's messages."""
-    changing = {
-        name: function
-        for name, function in inspect.getmembers(sqs, inspect.isfunction)
-        if '["messages"]' in (source := inspect.getsource(function))
-        and any(word in source for word in ('["messages"] =', '["messages"].', '["visible_at"] ='))
-    }
-    # `_collect_msgs` calls it.
-    del changing["_collect_fifo"]
-    assert len(changing) > 8
-    for name, function in changing.items():
-        source = inspect.getsource(function)
-        assert "@_locked" in source or "with _queues_lock:" in source, name

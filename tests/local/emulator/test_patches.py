@@ -1,62 +1,20 @@
-"""Every patch for ministack is still needed, applies to the pinned version, and closes its gap."""
+"""Every patch for ministack applies to the pinned version, alone, and says what it is for."""
 
 from __future__ import annotations
 
-import inspect
-import json
-import os
 import re
-import subprocess
-import sys
 
 import pytest
 
 from local.deployment import ROOT
 from local.emulator import package
 from local.processes import LocalError
-from testkit.waiting import GUARD_S
-from tests.local.emulator import patch_probes
 
-PATCHES = [patch.stem for patch in package.PATCHES]
 HEAD = re.compile(
     r"ministack [\d.]+: [^\n]+\n\n"
     r"AWS: (?P<aws>.+)\nministack: .+\nTest: (?P<file>\S+)::(?P<test>\w+)\n",
     re.DOTALL,
 )
-ASK = """
-import json, sys
-from tests.local.emulator import patch_probes
-from testkit.waiting import GUARD_S
-print(json.dumps({name: bool(getattr(patch_probes, name)()) for name in sys.argv[1:]}))
-"""
-
-
-def lacking(*folders):
-    """Return the gaps of a ministack: the installed one, or the one in a folder."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*folders, ROOT)))}
-    command = [sys.executable, "-c", ASK, *PATCHES]
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=GUARD_S
-    )
-    assert done.returncode == 0, done.stderr
-    return {name for name, lacks in json.loads(done.stdout.splitlines()[-1]).items() if lacks}
-
-
-def test_every_patch_has_a_probe():
-    own = {
-        name
-        for name, one in inspect.getmembers(patch_probes, inspect.isfunction)
-        if one.__module__ == patch_probes.__name__
-    }
-    assert own == set(PATCHES)
-
-
-def test_the_pinned_ministack_needs_every_patch():
-    assert lacking() == set(PATCHES), "a new ministack does not need every patch of local/patches/"
-
-
-def test_the_patched_ministack_needs_no_patch():
-    assert lacking(package.folder()) == set()
 
 
 @pytest.mark.parametrize("patch", package.PATCHES, ids=lambda patch: patch.stem)

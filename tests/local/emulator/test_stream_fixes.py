@@ -144,44 +144,6 @@ def test_a_destination_is_told_again_if_its_message_is_undone(cloud, monkeypatch
     assert ledger.read_committed("SELECT count(*) FROM messages") == [(1,)]
 
 
-def test_a_partial_failure_is_retried_from_its_lowest_sequence_number(cloud):
-    numbers = {}
-
-    def answer(seen):
-        for record in dynamodb.stream_live_records("gap", account_id=ACCOUNT, region=REGION):
-            numbers[int(record["dynamodb"]["Keys"]["t"]["N"])] = record["dynamodb"]["SequenceNumber"]
-        failures = [{"itemIdentifier": numbers[2]}] if len(cloud.seen) == 1 else []
-        return {"body": {"batchItemFailures": failures}}
-
-    cloud.answer = answer
-    cloud.put(*range(4))
-    cloud.poll_until(lambda: len(cloud.seen) == 2)
-    assert cloud.seen == [[0, 1, 2, 3], [2, 3]]
-
-
-def test_a_throttled_batch_is_retried_without_loss(cloud):
-    answers = iter([{"throttle": True, "error": True}] * 3)
-    cloud.answer = lambda _: next(answers, {"body": None})
-    cloud.put(1)
-    cloud.poll_until(lambda: len(cloud.seen) == 4)
-    assert cloud.told == []
-
-
-def test_a_batching_window_collects_its_records(cloud):
-    lambda_svc._esms["gap-mapping"]["MaximumBatchingWindowInSeconds"] = 2
-    now = 1_000.0
-    cloud.mappings = StreamMappings(cloud.streams, lambda: now)
-    cloud.put(0)
-    assert not cloud.mappings.poll()
-    now += 1.5
-    cloud.put(1)
-    assert not cloud.mappings.poll()
-    assert cloud.seen == []
-    now += 0.5
-    cloud.poll_until(lambda: cloud.seen)
-    assert cloud.seen == [[0, 1]]
-
-
 def test_the_poller_wakes_at_the_end_of_the_window(cloud):
     lambda_svc._esms["gap-mapping"]["MaximumBatchingWindowInSeconds"] = 1
     cloud.put(0)

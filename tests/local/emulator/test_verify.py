@@ -24,7 +24,7 @@ from testkit.waiting import InstrumentError
 from verify import report, run
 from verify.deployment import CHANGES
 from verify.question import CHANGED, ENDED, Question, Verdict, ask
-from verify.questions import ALL, live
+from verify.questions import ALL
 
 RULES = tuple(one for one in ALL if one.subject == "rules")
 
@@ -40,17 +40,6 @@ def target(embedded, tmp_path_factory):
 def test_the_embedded_cloud_answers_as_assumed_or_measured(target, check):
     answer = ask(check, target, time.monotonic, report.load().seen.get(check.name))
     assert answer.verdict is Verdict.AS_ASSUMED, (answer.reason, answer.seen)
-
-
-def test_pubnub_keys_are_lent_to_a_deployment_without_keys_and_removed(embedded, tmp_path):
-    cloud = replace(embedded.cloud, namespace="other")
-    with live.keys_lent(Target(EMBEDDED, cloud, tmp_path)):
-        assert load_keys(cloud) == load_keys(embedded.cloud)
-    with pytest.raises(StationError, match="not stored yet"):
-        load_keys(cloud)
-    with live.keys_lent(Target(EMBEDDED, embedded.cloud, tmp_path)):
-        pass
-    assert load_keys(embedded.cloud)
 
 
 class Recorder:
@@ -113,19 +102,6 @@ def test_a_failed_run_is_destroyed_and_its_answers_are_reported(embedded, tmp_pa
         run.run(options(tmp_path, only=(first, with_key)), embedded.cloud, recorder)
     assert recorder.told == [{}, CHANGES, "destroyed"]
     assert len(json.loads((tmp_path / "report.json").read_text())["answers"]) == 1
-
-
-def test_leftovers_after_a_failure_are_reported(embedded, tmp_path, capsys):
-    class Failing(Recorder):
-        def deploy(self, settings):
-            raise InstrumentError("cdk deploy failed")
-
-        def destroy(self):
-            return ["the stack storage"]
-
-    with pytest.raises(InstrumentError, match="cdk deploy failed"):
-        run.run(options(tmp_path), embedded.cloud, Failing())
-    assert "left over: the stack storage" in capsys.readouterr().out
 
 
 def question(name, seen, ask):

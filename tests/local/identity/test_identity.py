@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import stat
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,20 +12,10 @@ from iort_contract.cloud import claim_name
 from iort_contract.tables import ROBOT
 from iort_station.fleet import identity, robots
 from iort_station.operations import audit
-from local.cloud import ROOT
 from testkit.mqtt import WAIT_S, Robot
-from testkit.waiting import GUARD_S, until
-from tests.local.conftest import run_agent
-
-AGENT = Path(sys.executable).parent / "iort-agent"
-
-
-def command(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [AGENT, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == status, done.stdout + done.stderr
-    return done
+from testkit.waiting import until
+from tests.local.conftest import command, run_agent
+from tests.local.data.drives import Agent
 
 
 def certificates(embedded: Any, robot: str) -> list[str]:
@@ -143,35 +129,15 @@ def test_a_failed_renewal_keeps_the_old_certificate(embedded, bundle, tmp_path, 
 def test_a_certificate_is_renewed_while_the_agent_runs(embedded, bundle, tmp_path):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
     claim = identity.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
-    report = tmp_path / "report.json"
-    with subprocess.Popen([AGENT, "--config", car.config, "--report", report], cwd=ROOT) as agent:
-        try:
-            until(lambda: _connected(car.config))
-            command("renew", "--config", car.config, "--claim", claim)
-            state = until(lambda: _status(car.config))
-            # The old certificate is no longer needed.
-            old, new = sorted(
-                certificates(embedded, car.robot),
-                key=lambda arn: arn.endswith(state["connection"]["certificate_id"]),
-            )
-            assert new.endswith(state["connection"]["certificate_id"])
-            embedded.cloud.client("iot").update_certificate(
-                certificateId=old.rsplit("/", 1)[-1], newStatus="REVOKED"
-            )
-        finally:
-            agent.terminate()
-            assert agent.wait(GUARD_S) == 0
-    sent = json.loads(report.read_text())["streams"]["vesc"]["samples"]
+    with Agent(car) as agent:
+        until(lambda: agent.told()["connection"]["connected"])
+        command("renew", "--config", car.config, "--claim", claim)
+        held = agent.told()["connection"]["certificate_id"]
+        # The old certificate is no longer needed.
+        old, new = sorted(certificates(embedded, car.robot), key=lambda arn: arn.endswith(held))
+        assert new.endswith(held)
+        embedded.cloud.client("iot").update_certificate(
+            certificateId=old.rsplit("/", 1)[-1], newStatus="REVOKED"
+        )
+    sent = agent.report()["streams"]["vesc"]["samples"]
     until(lambda: audit.delivery(embedded.cloud, car.robot, "vesc").samples_stored == sent)
-
-
-def _connected(config: Path) -> bool:
-    state = _status(config)
-    return state is not None and bool(state["connection"]["connected"])
-
-
-def _status(config: Path) -> Any:
-    done = subprocess.run(
-        [AGENT, "status", "--config", config, "--json"], capture_output=True, text=True, check=False
-    )
-    return json.loads(done.stdout) if done.returncode == 0 else None

@@ -21,7 +21,8 @@ from iort_contract.tables import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS,
 from iort_station.fleet import identity, registry
 from local.cloud import ROOT
 from testkit.mqtt import Robot
-from tests.local.identity.test_identity import certificates, command
+from tests.local.conftest import command
+from tests.local.identity.test_identity import certificates
 
 # The process dies as if the battery failed: before AWS IoT is asked to register, or right after.
 KILLED = """

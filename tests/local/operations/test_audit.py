@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import json
 
-from typer.testing import CliRunner
-
 from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import SourceAccount, StreamAccount
 from iort_contract.messages.batch import Batch, batch_id, encode_batch
 from iort_contract.tables import BATCH, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
-from iort_station.cli.main import app
 from iort_station.operations import audit
 from testkit.mqtt import Robot
 from testkit.waiting import until
 from tests.local.conftest import run_agent
 
 T0_US = 1_760_000_000_000_000
-
-
-def _run(embedded, *arguments, verb="audit"):
-    where = ["--local", "--embedded", str(embedded.folder / "cloud.json")]
-    return CliRunner().invoke(app, [*where, verb, *arguments, "--json"])
 
 
 def _delete(embedded, robot, stream, item):
@@ -35,40 +27,40 @@ def _delete(embedded, robot, stream, item):
     )
 
 
-def test_the_audit_confirms_a_drive_and_finds_a_lost_batch_of_any_stream(embedded, bundle):
+def test_the_audit_confirms_a_drive_and_finds_a_lost_batch_of_any_stream(embedded, bundle, iort):
     car = bundle(
         sources=[{"type": "sim", "stream": "wheels", "rate_hz": 100, "duration_s": 2}],
         record={"batch_s": 0.25},
         live={"enabled": False},
     )
     run_agent(car)
-    done = _run(embedded, car.robot)
+    done = iort("audit", car.robot, "--json")
     assert done.exit_code == 0, done.output
     streams = {one["stream"]: one for one in json.loads(done.stdout)["streams"]}
     assert {"wheels", ACCOUNT_STREAM} <= streams.keys()
     assert all(one["complete"] for one in streams.values())
     wheels = streams["wheels"]
     assert (wheels["taken"], sum(run["samples"] for run in wheels["runs"])) == (200, 200)
-    told = json.loads(_run(embedded, "--all").stdout)["robots"][car.robot]["streams"]
+    told = json.loads(iort("audit", "--all", "--json").stdout)["robots"][car.robot]["streams"]
     assert {one["stream"]: one["complete"] for one in told} == dict.fromkeys(streams, True)
-    assert _run(embedded).exit_code == _run(embedded, car.robot, "--all").exit_code != 0
+    assert iort("audit", "--json").exit_code == iort("audit", car.robot, "--all", "--json").exit_code != 0
     found = list(audit.headers(embedded.cloud, car.robot, "wheels"))
     assert all("samples" not in item for item in found)
     seq = batch_id(found[3][BATCH]).seq
     samples = int(found[3]["n"])
     _delete(embedded, car.robot, "wheels", found[3])
-    done = _run(embedded, car.robot)
+    done = iort("audit", car.robot, "--json")
     assert done.exit_code == 1
     (wheels,) = [one for one in json.loads(done.stdout)["streams"] if one["stream"] == "wheels"]
     (gap,) = wheels["runs"][0]["missing"]
     assert gap["first"] == gap["last"] == seq
     # `iort runs` and `iort streams` find the same run from a few batches.
-    (run,) = json.loads(_run(embedded, car.robot, verb="runs").stdout)["runs"]
+    (run,) = json.loads(iort("runs", car.robot, "--json").stdout)["runs"]
     assert run["state"] == "ended"
     assert 1.9 < run["seconds"] < 2.1
     assert run["streams"]["wheels"]["samples"] == 200
     listed = {
-        one["stream"]: one for one in json.loads(_run(embedded, car.robot, verb="streams").stdout)["streams"]
+        one["stream"]: one for one in json.loads(iort("streams", car.robot, "--json").stdout)["streams"]
     }
     assert (listed["wheels"]["runs"], listed["wheels"]["from"]) == (1, run["from"])
     assert {"name": "speed", "unit": "erpm"} in listed["wheels"]["fields"]
@@ -79,14 +71,16 @@ def test_the_audit_confirms_a_drive_and_finds_a_lost_batch_of_any_stream(embedde
     for item in audit.headers(embedded.cloud, car.robot, "wheels"):
         _delete(embedded, car.robot, "wheels", item)
     (wheels,) = [
-        one for one in json.loads(_run(embedded, car.robot).stdout)["streams"] if one["stream"] == "wheels"
+        one
+        for one in json.loads(iort("audit", car.robot, "--json").stdout)["streams"]
+        if one["stream"] == "wheels"
     ]
     assert (wheels["runs"], wheels["complete"]) == ([], False)
     assert [short["samples"] for short in wheels["shortfalls"]] == [200]
-    assert _run(embedded, "nobody-like-that").exit_code == 1
+    assert iort("audit", "nobody-like-that", "--json").exit_code == 1
 
 
-def test_each_run_names_the_run_before_it(embedded, bundle):
+def test_each_run_names_the_run_before_it(embedded, bundle, iort):
     """After a restart with a queue file, the next run's first batch reveals the lost end of a run."""
     car = bundle(
         queue={"path": "spool.db"},
@@ -96,18 +90,20 @@ def test_each_run_names_the_run_before_it(embedded, bundle):
     )
     run_agent(car)
     run_agent(car)
-    assert _run(embedded, car.robot, "--from-start").exit_code == 0
+    assert iort("audit", car.robot, "--from-start", "--json").exit_code == 0
     found = list(audit.headers(embedded.cloud, car.robot, "wheels"))
     first = min(batch_id(item[BATCH]) for item in found).boot
     last = max(batch_id(item[BATCH]) for item in found if batch_id(item[BATCH]).boot == first)
     _delete(embedded, car.robot, "wheels", {BATCH: str(last)})
-    (wheels,) = json.loads(_run(embedded, car.robot, "--stream", "wheels", "--last", "1h").stdout)["streams"]
+    (wheels,) = json.loads(iort("audit", car.robot, "--stream", "wheels", "--last", "1h", "--json").stdout)[
+        "streams"
+    ]
     (gap,) = wheels["runs"][0]["missing"]
     assert (gap["first"], gap["last"], gap["before_us"]) == (last.seq, last.seq, None)
     assert not wheels["runs"][1]["missing"]
 
 
-def test_the_audit_reports_unrecorded_samples_by_cause(embedded, bundle):
+def test_the_audit_reports_unrecorded_samples_by_cause(embedded, bundle, iort):
     car = bundle()
     boot = "0badcafe0badcafe"
     told = [
@@ -124,7 +120,7 @@ def test_the_audit_reports_unrecorded_samples_by_cause(embedded, bundle):
         scan = Batch(boot, 0, [T0_US + i for i in range(9)], {"i": list(range(9))})
         assert robot.publish(record_topic(car.robot, "scan"), encode_batch(scan)) == "SUCCESS"
     until(lambda: list(audit.headers(embedded.cloud, car.robot, "scan")))
-    done = _run(embedded, car.robot)
+    done = iort("audit", car.robot, "--json")
     assert done.exit_code == 1
     answer = json.loads(done.stdout)
     streams = {one["stream"]: one for one in answer["streams"]}
@@ -135,7 +131,7 @@ def test_the_audit_reports_unrecorded_samples_by_cause(embedded, bundle):
     assert answer["not_recorded"] == {boot: {"ROS 1 topics /scan": {"/scan.malformed": 3}}}
 
 
-def test_the_audit_covers_a_stream_that_only_lambda_2_has_seen(embedded, bundle):
+def test_the_audit_covers_a_stream_that_only_lambda_2_has_seen(embedded, bundle, iort):
     car = bundle()
     with Robot(car.folder) as robot:
         robot.online()
@@ -145,7 +141,7 @@ def test_the_audit_covers_a_stream_that_only_lambda_2_has_seen(embedded, bundle)
     def seen():
         return [
             one["stream"]
-            for one in json.loads(_run(embedded, car.robot).stdout or '{"streams":[]}')["streams"]
+            for one in json.loads(iort("audit", car.robot, "--json").stdout or '{"streams":[]}')["streams"]
         ]
 
     until(lambda: "strangers" in seen())

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import time
 
 import pytest
 from ministack.core.responses import request_scope
-from ministack.services import cloudwatch, iot, lambda_svc, sqs
+from ministack.services import cloudwatch, sqs
 
 from functions.shared.metrics import emit
 from local.emulator.fixes import alarms, metrics
@@ -24,18 +23,6 @@ def empty():
 def values(namespace, name, **dimensions):
     alarms = cloudwatch._metrics.get((namespace, name, cloudwatch._dims_key(dimensions))) or []
     return sorted(point["Value"] for point in alarms for _ in range(int(point["Count"])))
-
-
-def test_wrapped_functions_accept_the_wrappers_arguments():
-    def parameters(function):
-        return list(inspect.signature(function).parameters)
-
-    assert parameters(lambda_svc._execute_function_dispatch) == [
-        "func", "config", "event", "request_id", "started",
-    ]  # fmt: skip
-    assert parameters(iot._dispatch_rule_action) == ["account_id", "region", "rule_name", "action", "event"]
-    assert parameters(cloudwatch._get_metric_data) == ["params", "cbor_data", "is_cbor", "is_json"]
-    assert parameters(cloudwatch._evaluate_alarm) == ["alarm"]
 
 
 def test_a_printed_metric_line_is_recorded(capsys, monkeypatch):

@@ -9,29 +9,17 @@ import json
 import time
 
 import pytest
-from typer.testing import CliRunner
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BY_FUNCTION, BY_STREAM, ENTRY, SAMPLES
-from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic, record_topic, rule_name
-from iort_station.cli.main import app
-from iort_station.cloud import EMBEDDED
+from iort_contract.topics import FILE, LAMBDA, LIVE, PING, RECORD, record_topic, rule_name
 from iort_station.data.recorded import summary_table, topic_of
 from iort_station.operations import audit, quarantine
 from testkit.mqtt import Robot
 from testkit.waiting import until
 
 RUN = "0badcafe"
-
-
-@pytest.fixture
-def iort(embedded):
-    def run(*arguments: str):
-        description = embedded.folder / EMBEDDED.name
-        return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments])
-
-    return run
 
 
 @pytest.fixture
@@ -63,54 +51,79 @@ def batch(seq=0, **changes):
 
 # --- messages in quarantine, and their origin ---------------------------------------------------------
 
+RULE, FILES = "rule iort_record", f"{BY_FUNCTION} iort-processing-Upload"
+RECORDED, LIVE_, PING_FILE = f"{RECORD}/iort/{{}}/vesc", f"{LIVE}/iort/{{}}/vesc", f"{PING}/iort/{{}}/{FILE}"
+# The topic and the message, the stage that refuses it, and a part of the reason.
+REFUSED = [
+    *(
+        (RECORDED, message, RULE, "DynamoDBv2Action")
+        for message in (
+            *(b"not json", b"\xff\xfe\x00", b'{"v": 1}', b"[]", b'{"batch": 5}', b""),
+            b'{"batch": "1", "a": ' + b"[" * 50_000 + b"]" * 50_000 + b"}",
+            b'{"batch": "1", "a": ' + b"9" * 5_000 + b"}",
+        )
+    ),
+    (RECORDED, batch(1, v=1), BY_STREAM, "schema version must be 2, got 1"),
+    (RECORDED, batch(2, codec="later"), BY_STREAM, "codec must be steps"),
+    (RECORDED, batch(3, samples="AAAA"), BY_STREAM, "samples must be base64 of zlib"),
+    (RECORDED, batch(batch="yesterday"), BY_STREAM, "must be <16 digits of microseconds>-<run>-<number>"),
+    (RECORDED, batch(batch="4000000000000000-0badcafe-0"), BY_STREAM, "clock is wrong"),
+    (
+        f"{RECORD}/iort/{{}}/b ad",
+        batch(4),
+        BY_STREAM,
+        "stream name must be 1 to 64 of A-Z a-z 0-9 _ -, got 'b ad'",
+    ),
+    (f"{RECORD}/iort/{{}}/a/b", batch(5), BY_STREAM, "must be <lane>/<namespace>/<robot>/<name>"),
+    *(
+        (LIVE_, message, f"{BY_FUNCTION} iort-processing-Live", "Refused: ContractError: ")
+        for message in (b'{"speed": 99}', b"\xff\x00 no JSON")
+    ),
+    (f"{PING}/iort/{{}}/{LAMBDA}", b"\xff\x00 no JSON", f"{BY_FUNCTION} iort-processing-Echo", "not JSON"),
+    *((PING_FILE, message, FILES, "not JSON") for message in (b"", b"\xff\x00", b"no JSON")),
+    *(
+        (PING_FILE, message, FILES, "Refused: ")
+        for message in (
+            *(b"[]", b"5", b"{}", b'{"id": 5}', b'{"id": "no-run"}', b'{"id": NaN}'),
+            *(b'{"id": null, "file": []}', b'{"id": {"a": 1}, "v": 1}'),
+        )
+    ),
+]
 
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"not json",
-        b"\xff\xfe\x00",
-        b'{"v": 1}',
-        b"[]",
-        b'{"batch": 5}',
-        b"",
-        b'{"batch": "1", "a": ' + b"[" * 50_000 + b"]" * 50_000 + b"}",
-        b'{"batch": "1", "a": ' + b"9" * 5_000 + b"}",
-    ],
-    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type", "empty", "nested", "digits"],
-)
-def test_a_message_that_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, payload):
+
+def test_each_refused_message_is_kept_byte_by_byte_with_its_stage_and_reason(embedded, bundle):
     car = bundle()
-    send(car, payload)
-    entry = entry_of(car.robot)
-    assert entry.payload == payload
-    assert entry.source == "rule iort_record"
-    assert entry.topic == f"dt/iort/{car.robot}/{VESC_STREAM}"
-    assert "DynamoDBv2Action" in entry.reason
+    with Robot(car.folder) as robot:
+        robot.online()
+        for topic, message, *_ in REFUSED:
+            assert robot.publish(topic.format(car.robot), message) == "SUCCESS"
+    listed = until(
+        lambda: (
+            len(found := list(quarantine.entries(embedded.cloud, robot=car.robot))) >= len(REFUSED) and found
+        )
+    )
+    entries = [quarantine.load(embedded.cloud, one) for one in listed]
+    for topic, message, stage, reason in REFUSED:
+        (entry,) = [one for one in entries if holds(one, topic.format(car.robot), message)]
+        assert entry.source.startswith(stage), message[:80]
+        assert reason in entry.reason, message[:80]
+    assert len(entries) == len(REFUSED)
 
 
-@pytest.mark.parametrize(
-    ("changes", "stream", "reason"),
-    [
-        ({"v": 1}, "vesc", "schema version must be 2, got 1"),
-        ({"codec": "later"}, "vesc", "codec must be steps"),
-        ({"samples": "AAAA"}, "vesc", "samples must be base64 of zlib"),
-        ({"batch": "yesterday"}, "vesc", "must be <16 digits of microseconds>-<run>-<number>"),
-        ({"batch": "4000000000000000-0badcafe-0"}, "vesc", "clock is wrong"),
-        ({}, "b ad", "stream name must be 1 to 64 of A-Z a-z 0-9 _ -, got 'b ad'"),
-        ({}, "a/b", "must be <lane>/<namespace>/<robot>/<name>"),
-    ],
-    ids=["version", "codec", "samples", "no-id", "years-ahead", "stream", "levels"],
-)
-def test_a_stored_batch_that_lambda_2_cannot_read_is_kept(bundle, entry_of, changes, stream, reason):
-    car = bundle()
-    message = batch(**changes)
-    send(car, message, stream=stream)
-    entry = entry_of(car.robot)
-    assert entry.source == BY_STREAM
-    assert reason in entry.reason
-    kept = json.loads(entry.payload)
-    for name, value in json.loads(message).items():
-        assert kept[name] in ({"S": value}, {"N": str(value)})
+def holds(entry, topic, message):
+    """Whether an entry has this message: its bytes, or what the rule has stored of it."""
+    if entry.source != BY_STREAM:
+        return (entry.topic, entry.payload) == (topic, message)
+    stored = json.loads(entry.payload)
+    try:
+        sent = json.loads(message)
+    except (ValueError, RecursionError):
+        return False
+    return (
+        isinstance(sent, dict)
+        and stored["topic"] == {"S": topic}
+        and all(stored.get(name) in ({"S": value}, {"N": str(value)}) for name, value in sent.items())
+    )
 
 
 def test_an_undecodable_batch_does_not_delay_its_neighbours(embedded, bundle, entry_of):
@@ -118,28 +131,6 @@ def test_an_undecodable_batch_does_not_delay_its_neighbours(embedded, bundle, en
     send(car, batch(0), batch(1, samples="AAAA"), batch(2))
     until(lambda: audit.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 2)
     assert json.loads(entry_of(car.robot).payload)["batch"]["S"].endswith("-1")
-
-
-@pytest.mark.parametrize("message", [b'{"speed": 99}', b"\xff\x00 no JSON"], ids=["JSON", "bytes"])
-def test_a_foreign_live_message_is_kept_byte_by_byte(bundle, entry_of, message):
-    car = bundle()
-    with Robot(car.folder) as robot:
-        robot.online().publish(build_topic(LIVE, car.robot, VESC_STREAM), message)
-    entry = entry_of(car.robot)
-    assert entry.payload == message
-    assert entry.source.startswith(f"{BY_FUNCTION} iort-processing-Live")
-    assert entry.reason.startswith("Refused: ContractError: ")
-
-
-@pytest.mark.parametrize("path", [LAMBDA, FILE])
-def test_a_ping_without_json_is_kept_byte_by_byte(bundle, entry_of, path):
-    car = bundle()
-    with Robot(car.folder) as robot:
-        robot.online().publish(build_topic(PING, car.robot, path), b"\xff\x00 no JSON")
-    entry = entry_of(car.robot)
-    assert entry.payload == b"\xff\x00 no JSON"
-    assert entry.source.startswith(f"{BY_FUNCTION} iort-processing-")
-    assert "not JSON" in entry.reason
 
 
 # --- the operator's commands ---------------------------------------------------------------------------

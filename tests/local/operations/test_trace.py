@@ -31,15 +31,11 @@ def test_the_trace_shows_every_hop_of_a_driving_car(embedded, bundle):
         ping={"rate_hz": 5},
         metrics={"every_s": 1},
     )
-    agent = Agent(car)
-    try:
+    with Agent(car) as agent:
         until(agent.status)
         done = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60")
         # The same car, by the way without PubNub.
         straight = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60", "--live", "iot")
-    finally:
-        agent.process.terminate()
-        agent.process.wait(GUARD_S)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["updates"] == 10

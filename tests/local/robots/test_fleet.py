@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import threading
 from importlib.metadata import version
-from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from iort_contract.tables import (
     ADMITTED_CERTIFICATE,
@@ -22,36 +18,15 @@ from iort_contract.tables import (
     ONLINE,
     SERIAL,
 )
-from iort_station.cli.main import app
-from iort_station.cloud import EMBEDDED
 from iort_station.errors import StationError
 from iort_station.fleet import identity, registry, robots
-from local.cloud import ROOT
 from testkit.mqtt import STALE, Robot
 from testkit.waiting import GUARD_S, until
-
-AGENT = Path(sys.executable).parent / "iort-agent"
+from tests.local.conftest import command
 
 
 def row(embedded, name):
     return registry.get(embedded.cloud, name)
-
-
-def command(*arguments, status=0):
-    done = subprocess.run(
-        [AGENT, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=GUARD_S, check=False
-    )
-    assert done.returncode == status, done.stdout + done.stderr
-    return done
-
-
-@pytest.fixture
-def iort(embedded):
-    def run(*arguments):
-        description = embedded.folder / EMBEDDED.name
-        return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments])
-
-    return run
 
 
 def test_only_the_registered_machine_gets_its_name(embedded, tmp_path, iort):
@@ -221,8 +196,6 @@ def test_a_revoked_claim_cannot_provision(embedded, tmp_path, iort):
         (("remove", "x", "--all"), "give a robot's name, or --all"),
         (("claim",), "give the robot's name, or --lasting"),
         (("register", "a", "b", "--serial", "s"), "--serial is for one machine"),
-        (("show", "nobody"), "robot nobody is not registered"),
-        (("rotate", "nobody"), "robot nobody is not registered"),
         (("register", "a/b"), "got 'a/b'"),
     ],
 )

@@ -19,7 +19,8 @@ from iort_station.cloud import EMBEDDED
 from iort_station.operations import audit
 from local.demo import DOWNLINK
 from testkit.waiting import until
-from tests.local.robots.test_shadow import Shadow, driving
+from tests.local.data.drives import Agent
+from tests.local.robots.test_shadow import Shadow
 
 _KEY_S = 0.05
 # Characters of what `iort drive` shows at a time, about.
@@ -34,7 +35,7 @@ def test_a_car_is_driven_stopped_and_released_and_the_stop_outlives_the_agent(em
     def send():
         return iort("send", robot, "drive", FORWARDS, "--lease-ms", "1000")
 
-    with driving(car):
+    with Agent(car):
         until(lambda: decode_reported(shadow.reported()).drive)
         assert decode_reported(shadow.reported()).drive.max_speed_mps == 2.0
         # On a slow machine a command may come too late.
@@ -43,7 +44,7 @@ def test_a_car_is_driven_stopped_and_released_and_the_stop_outlives_the_agent(em
         refused = until(lambda: "emergency stop" in str((one := send()).exception) and one)
         assert refused.exit_code == 1
     assert iort("stop", robot).stdout == f"{robot}: stopped\n", "as it said before it ended"
-    with driving(car):
+    with Agent(car):
         until(lambda: "emergency stop" in str(send().exception))
         until(lambda: iort("stop", robot, "--release").stdout == f"{robot}: released\n")
         until(lambda: "has accepted drive" in send().output)
@@ -86,7 +87,7 @@ def test_a_car_is_driven_by_keys_and_stops_when_the_terminal_freezes(embedded, b
     car = bundle(sources=[{"type": "sim", "rate_hz": 50}], downlink=DOWNLINK)
     shadow = Shadow(embedded, car.robot)
     iort = [Path(sys.executable).parent / "iort", "--embedded", embedded.folder / EMBEDDED.name]
-    with driving(car):
+    with Agent(car):
         until(lambda: decode_reported(shadow.reported()).drive)
         terminal = Terminal(*iort, "drive", car.robot, "--by", "anna", "--max-speed", "0.5")
         try:

@@ -22,17 +22,12 @@ def test_a_page_wakes_its_car_and_one_that_is_cut_off_lets_it_sleep(embedded, bu
         return found
 
     told = {"namespace": embedded.namespace, **embedded.keys.reading()}
-    with PageServer(**told, open_actions=actions(embedded.cloud)) as server:
-        agent = Agent(car)
-        try:
-            until(agent.status)
-            assert lane()["viewers"] == 0
-            page = open_page(f"{server.url}#/car/{car.robot}")
-            until(lambda: lane()["viewers"] == 1)
-            assert lane()["asked_hz"] == LIVE_MAX_RATE_HZ
-            page.context.set_offline(True)
-            until(lambda: lane()["viewers"] == 0)
-            assert lane()["asked_hz"] == 1 / LIVE_BROKER_EVERY_S
-        finally:
-            agent.stop()
-            agent.report()
+    with PageServer(**told, open_actions=actions(embedded.cloud)) as server, Agent(car) as agent:
+        until(agent.status)
+        assert lane()["viewers"] == 0
+        page = open_page(f"{server.url}#/car/{car.robot}")
+        until(lambda: lane()["viewers"] == 1)
+        assert lane()["asked_hz"] == LIVE_MAX_RATE_HZ
+        page.context.set_offline(True)
+        until(lambda: lane()["viewers"] == 0)
+        assert lane()["asked_hz"] == 1 / LIVE_BROKER_EVERY_S
