@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from statistics import quantiles
 from typing import Any
 
@@ -66,19 +66,7 @@ class Figures:
 
     def as_json(self) -> dict[str, Any]:
         """The figures under the names of the report."""
-        return {
-            "samples_sent": self.samples_sent,
-            "samples_stored": self.samples_stored,
-            "samples_summarized": self.samples_summarized,
-            "samples_lost": self.samples_lost,
-            "live_published": self.live_published,
-            "live_received": self.live_received,
-            "rtt_ms": {path: {"p50": s.p50, "p95": s.p95} for path, s in self.rtt_ms.items()},
-            "car_to_dashboard_ms": {
-                "p50": self.car_to_dashboard_ms.p50,
-                "p95": self.car_to_dashboard_ms.p95,
-            },
-        }
+        return asdict(self) | {"samples_lost": self.samples_lost}
 
     def as_table(self) -> Table:
         """The figures as a table for the terminal."""

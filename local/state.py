@@ -65,10 +65,6 @@ class Settings:
         """Write the folder's file, for its owner alone."""
         write_private(folder / FILE, f"{json.dumps(asdict(self), indent=2)}\n".encode())
 
-    def with_port(self, server: str, port: int) -> Self:
-        """These settings, with the port of a server."""
-        return replace(self, ports={**self.ports, server: port})
-
 
 _Form = tuple[str, Callable[[Any], bool]]
 _HOSTS: _Form = (f"hosts such as 192.168.1.10,iort.lab, or {NO}", lambda value: isinstance(value, str))
@@ -215,8 +211,7 @@ class StateFolder:
     def remember_port(self, server: str, port: int) -> None:
         """Remember the port at which a server listens. One that has only been free may be another cloud's by
         now."""
-        if self.kept:
-            self.settings().with_port(server, port).save(self.path)
+        self.remember(ports={**self.settings().ports, server: port})
 
     def port(self, name: str, *hosts: str, wanted: int = 0) -> int:
         """The port ``wanted``, or the one of the last start, or the usual one if it is free, unless any will

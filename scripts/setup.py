@@ -157,7 +157,7 @@ def check_machine() -> None:
 
 def run(step: Step, began: float) -> None:
     """Run a step's commands, unless they succeeded before with the same inputs and the same Python."""
-    stamp, log = STAMPS / step.name, STAMPS / "log"
+    stamp, log = STAMPS / step.name, STAMPS / f"{step.name}.log"
     key = hashlib.sha256(f"{BASE_PYTHON} {sys.version} {step.commands}".encode())
     for path in sorted(path for pattern in step.inputs for path in ROOT.glob(pattern) if path.is_file()):
         key.update(str(path).encode() + path.read_bytes())

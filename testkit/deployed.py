@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from aws_cdk import App
 from boto3.dynamodb.types import TypeSerializer
 
-from app import build
 from iort_contract.archive import DUE, TASK
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.analysis import DriveKey, PlannedDrive, encode_planned
@@ -26,7 +24,6 @@ from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.messages.questions import Ask, encode_ask
 from iort_contract.tables import BATCH, PUT_OFF, RECEIVED_MS, ROBOT_PARAMETER, SERIAL_PARAMETER, TOPIC
 from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, RECORD, build_topic
-from stacks.settings import Settings
 from testkit.runtime import Function
 
 
@@ -35,6 +32,12 @@ def functions(folder: Path, layer: Path) -> dict[str, Function]:
 
     The analysis has this machine's numpy and pyarrow in place of its layer for AWS' processors.
     """
+    # Imported here, because the CDK takes seconds to load.
+    from aws_cdk import App  # noqa: PLC0415 - as above
+
+    from app import build  # noqa: PLC0415 - as above
+    from stacks.settings import Settings  # noqa: PLC0415 - as above
+
     arrays, empty = folder / "arrays", folder / "empty"
     (arrays / "python").mkdir(parents=True)
     for name in ("numpy", "numpy.libs", "pyarrow"):

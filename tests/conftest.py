@@ -22,18 +22,20 @@ settings.load_profile("iort")
 settings.register_profile("fast", settings.get_profile("iort"), max_examples=10, stateful_step_count=10)
 
 # Tests that share something costly run in one worker of `make test`: an embedded cloud, the demo, which
-# starts its own cloud, the synthesized app, the browser. They start first, in this order: a long group that
-# starts last runs alone. A node id's beginning decides, and the first that fits; a group runs in the order of
-# its paths here.
+# starts its own cloud, the synthesized app. They start first, in this order: a long group that starts last
+# runs alone. A node id's beginning decides, and the first that fits; a group runs in the order of its paths
+# here. Without a name each file is a group, but starts early all the same: those of the browser are long.
 GROUPS = {
     "tests/local/commands/test_demo.py": "demo",
     "tests/local/commands/": "cloud of the data",
-    # Before the others have raised the alarms that it waits for.
-    "tests/local/operations/test_eyes.py": "cloud of the data",
     "tests/local/data/": "cloud of the data",
-    "tests/local/operations/": "cloud of the data",
-    "tests/local/page/": "cloud of the data",
     "tests/ros/test_two_robots.py": "cloud of the data",
+    # It analyses every drive that the cloud has.
+    "tests/local/analysis/": "cloud of the faults",
+    # Before the others have raised the alarms that it waits for.
+    "tests/local/operations/test_eyes.py": "cloud of the faults",
+    "tests/local/operations/": "cloud of the faults",
+    "tests/local/page/": "cloud of the faults",
     "tests/local/faults/": "cloud of the faults",
     "tests/ros/mixed/test_mixed_robot.py": "cloud of the faults",
     "tests/ros/test_two_publishers.py": "cloud of the faults",
@@ -42,7 +44,7 @@ GROUPS = {
     "tests/local/network/": "cloud of the robots",
     "tests/local/identity/": "cloud of the robots",
     "tests/local/robots/": "cloud of the robots",
-    "tests/web/": "page",
+    "tests/web/": "",
     "tests/stacks/": "app",
     "tests/unit/functions/test_admit.py": "app",
     "tests/local/pubnub/": "PubNub",
@@ -54,7 +56,7 @@ def group(nodeid: str) -> str:
     file.
     """
     for path, name in GROUPS.items():
-        if nodeid.startswith(path):
+        if name and nodeid.startswith(path):
             return name
     return nodeid if nodeid.startswith("tests/ros/") else nodeid.split("::", 1)[0]
 
@@ -66,7 +68,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     def place(nodeid: str) -> tuple[int, int]:
         path = next((i for i, path in enumerate(paths) if nodeid.startswith(path)), len(paths))
-        return order.get(group(nodeid), len(order)), path
+        return order[GROUPS[paths[path]]] if path < len(paths) else len(order), path
 
     items.sort(key=lambda item: place(item.nodeid))
 

@@ -22,7 +22,7 @@ from iort_station.page import motion
 from iort_station.page.answers import actions, answers, keyed_actions
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.network.proxy import Proxy
+from testkit.proxy import Proxy
 from testkit.ros import RosGraph
 from testkit.waiting import InstrumentError
 

@@ -21,8 +21,8 @@ from bench.load.course import LEASE_S, ROBOT, Course, Try
 from bench.report import Report, Section
 from bench.sections import Declared, Option
 from local.figures import Spread
-from local.network.proxy import FREEZE, PASS
 from testkit.chromium import Tabs
+from testkit.proxy import FREEZE, PASS
 from testkit.ros import python_with_rospy
 from testkit.target import Say, Target
 from testkit.waiting import InstrumentError

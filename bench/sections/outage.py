@@ -23,8 +23,8 @@ from iort_contract.tables import BATCH
 from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle
 from iort_station.operations import audit
-from local.network.proxy import PASS, REFUSE, Proxy
 from testkit.car import AgentProcess
+from testkit.proxy import PASS, REFUSE, Proxy
 from testkit.target import Say, Target
 from testkit.waiting import reached, until
 

@@ -29,8 +29,8 @@ from iort_station.fleet.robots import Bundle
 from iort_station.page.page import load_keys
 from iort_station.page.pubnub import Listener
 from local.figures import THESIS, THESIS_MS
-from local.network.proxy import Proxy
 from testkit.car import ENVELOPE, AgentProcess, Connected
+from testkit.proxy import Proxy
 from testkit.target import Say, Target
 from testkit.waiting import InstrumentError
 

@@ -22,9 +22,6 @@ from ministack.core.responses import get_account_id, get_region
 from ministack.services import cloudformation, iot
 
 from local.persistence import documents
-from local.persistence import documents as calls
-from local.persistence import documents as executions
-from local.persistence import documents as states
 from local.persistence.documents import Document
 from local.persistence.ledger import Ledger, LedgerError
 
@@ -53,7 +50,7 @@ class Services:
         self._ledger = ledger
         self._lock = threading.Lock()
         self._deploying = False
-        self._interrupted: list[executions.Key] = []
+        self._interrupted: list[documents.Key] = []
         ledger.define(_SCHEMA)
         ledger.on_undo.append(self._undone)
 
@@ -79,8 +76,8 @@ class Services:
             )
             state = documents.join(iter(rows), self._bytes)
             if service == "stepfunctions":
-                self._interrupted = executions.running(state)
-            states.load(app._get_module(service), state)
+                self._interrupted = documents.running(state)
+            documents.load(app._get_module(service), state)
         self._drop_blobs()
         threading.Thread(target=self._tick, daemon=True, name="keeping").start()
 
@@ -90,7 +87,7 @@ class Services:
 
     def go_on(self) -> None:
         """Begin anew what was interrupted."""
-        executions.begin_anew(self._interrupted)
+        documents.begin_anew(self._interrupted)
 
     def save(self, service: str) -> None:
         """Write the documents of a service that have changed. Raises `LedgerError`."""
@@ -123,7 +120,7 @@ class Services:
     def _save(self, service: str) -> None:
         rows = self._ledger.read("SELECT store, key, digest FROM documents WHERE service = ?", (service,))
         saved = {(store, key): digest for store, key, digest in rows}
-        state = states.read_states(sys.modules[_name(service)])
+        state = documents.read_states(sys.modules[_name(service)])
         with self._ledger.write() as connection:
             for one in documents.split(state, self._keep_bytes):
                 if saved.pop((one.store, one.key), None) != one.digest:
@@ -155,13 +152,13 @@ class Services:
         ) -> Response:
             answer = await handler(method, path, headers, body, query)
             if service == "cloudformation":
-                self._deploying = self._deploying or calls.may_change(method, path, headers, body, query)
+                self._deploying = self._deploying or documents.may_change(method, path, headers, body, query)
                 if self._deploying:
                     self.save_all()
             elif (
                 service not in _NO_DOCUMENTS
-                and not (service == "s3" and calls.is_object(path))
-                and calls.may_change(method, path, headers, body, query)
+                and not (service == "s3" and documents.is_object(path))
+                and documents.may_change(method, path, headers, body, query)
             ):
                 self.save(service)
             return answer
@@ -195,7 +192,7 @@ class Services:
 
     def _save_later(self) -> None:
         try:
-            executions.forget_old()
+            documents.forget_old()
             self.save_all()
             self._ledger.commit()
         except LedgerError as error:
@@ -213,7 +210,7 @@ class Retained(dict[str, Any]):
 
     def __setitem__(self, topic: str, message: Any) -> None:
         super().__setitem__(topic, message)
-        document = states.retained(message)
+        document = documents.retained(message)
         self._services.put("iot", Document.of("retained", "plain", topic, document, lambda _: ""))
 
     def __delitem__(self, topic: str) -> None:

@@ -12,8 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from cfnlint.schema.manager import PROVIDER_SCHEMA_MANAGER
-
 from local.deployment import ROOT, sources
 from local.emulator.package import artifact
 
@@ -156,6 +154,9 @@ _ONE_OF = {
 
 def schema(kind: str) -> dict[str, Any]:
     """The schema of a resource's type."""
+    # Imported here, because cfn-lint takes a second to load.
+    from cfnlint.schema.manager import PROVIDER_SCHEMA_MANAGER
+
     return dict(PROVIDER_SCHEMA_MANAGER.get_resource_schema("us-east-1", kind).schema)
 
 

@@ -9,41 +9,22 @@ contract and the ledger, nothing else of this project.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from importlib import import_module
 
-# In the order of their installation: a later wrapper is around an earlier one.
-NAMES = (
-    "broker.client_certificate",
-    "broker.delivery_time",
-    "broker.https_port",
-    "broker.rule_time",
-    "broker.server_certificate",
-    "invocations.async_invocations",
-    "stream_retries.stream_retries",
-    "invocations.log_end",
-    "invocations.log_retention",
-    "tables.query_time",
-    "tables.number_checks",
-    "storage.object_expiry",
-    "storage.request_time",
-    "storage.own_paths",
-    "metrics.embedded_metrics",
-    "metrics.lambda_metrics",
-    "metrics.iot_metrics",
-    "metrics.queue_metrics",
-    "metrics.metric_search",
-    "alarms.alarm_state",
-    "alarms.alarm_timer",
-)
+# In the order of their installation, as are the functions of each: a later wrapper is around an earlier one.
+_MODULES = ("broker", "invocations", "stream_retries", "tables", "storage", "metrics", "alarms")
+
+
+def every() -> Iterator[tuple[str, Callable[[], None]]]:
+    """The name of each difference, and what closes it in this process. Only here is ministack imported."""
+    for module in _MODULES:
+        for name, value in vars(import_module(f"{__name__}.{module}")).items():
+            if name.startswith("close_"):
+                yield f"{module}.{name.removeprefix('close_')}", value
 
 
 def install() -> None:
     """Close every difference in this process, before the emulator starts."""
-    for name in NAMES:
-        close(name)
-
-
-def close(name: str) -> None:
-    """Close one difference. Only here is ministack imported."""
-    module, function = name.split(".")
-    vars(import_module(f"{__name__}.{module}"))[f"close_{function}"]()
+    for _, close in every():
+        close()

@@ -66,7 +66,7 @@ def close_async_invocations() -> None:
     Test: tests/local/emulator/test_fixes.py::test_an_event_that_breaks_the_emulator_goes_to_its_destination
     Patch: none; it needs a queue for each function, which is more than a small patch
     """
-    iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch
+    iot._dispatch_rule_to_lambda = AsyncInvocations().queue
 
 
 class AsyncInvocations:
@@ -79,10 +79,6 @@ class AsyncInvocations:
     def __init__(self) -> None:
         self._pools: dict[str, Turns] = {}
 
-    def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
-        """Queue one event; raises `LookupError` for an unknown function."""
-        self.queue(account, region, function_arn, event)
-
     def queue(
         self,
         account: str,
@@ -92,7 +88,8 @@ class AsyncInvocations:
         *,
         done: Callable[[], object] = lambda: None,
     ) -> None:
-        """As `dispatch`; ``done`` is called when the event needs no more attempt."""
+        """Queue one event; ``done`` is called when it needs no more attempt. Raises `LookupError` for an
+        unknown function."""
         function, config, _ = lambda_svc._get_func_record_for_ref_in_scope(
             function_arn, account_id=account, region=region
         )

@@ -62,6 +62,7 @@ def car7(embedded, tmp_path_factory):
     robots.remove(embedded.cloud, "car7")
 
 
+@pytest.mark.heavy
 def test_every_example_does_what_it_says(embedded, iort, car7, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "track.json").write_text(json.dumps({"track": HALL.csv()}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.ros1.decode import HEADER
-from iort_contract.topics import record_topic
 from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.operations import audit
-from testkit.mqtt import Robot
-from testkit.waiting import until
 from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent
 from tests.recordings import recording
@@ -156,26 +150,3 @@ def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, iort, tmp_pat
 
     done = iort(*asked, str(exported))
     assert "exists" in str(done.exception)
-
-
-def test_fields_that_appear_later_are_exported(embedded: Any, bundle: Any, iort: Any, tmp_path: Path) -> None:
-    car, noise = bundle(), np.random.default_rng(1)
-    t_us, n, batches = 1_760_000_000_000_000, 2000, 14
-    wide = [{f"x{i}": noise.random(n).tolist() for i in range(4)} for _ in range(batches)]
-    with Robot(car.folder) as robot:
-        robot.online()
-        # More than one page of the table, and then another field.
-        for seq, columns in enumerate([*wide, {"y": [1.5]}]):
-            times = [t_us + seq * 1_000_000 + i for i in range(len(next(iter(columns.values()))))]
-            batch = Batch("0badcafe", seq, times, columns)
-            assert robot.publish(record_topic(car.robot, "s"), encode_batch(batch)) == "SUCCESS"
-    until(lambda: len(list(audit.items(embedded.cloud, car.robot, "s"))) == batches + 1)
-    path = tmp_path / "s.bag"
-    done = iort("export", car.robot, "s", "--last", "all", "-o", str(path))
-    assert done.exit_code == 0, done.output
-    with AnyReader([path]) as reader:
-        *_, (connection, _, raw) = reader.messages()
-        assert sum(1 for _ in reader.messages()) == n * batches + 1
-    assert "float64 y" in connection.msgdef.data
-    assert HEADER.unpack_from(raw)[0] == n * batches
-    assert raw.endswith(struct.pack("<d", 1.5))

@@ -43,9 +43,9 @@ from iort_station.migration.files import base64_sha256
 from iort_station.operations import archive, audit, quarantine
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from local.network.proxy import REFUSE, Proxy
 from testkit.mqtt import Robot
 from testkit.ports import free_port
+from testkit.proxy import REFUSE, Proxy
 from testkit.waiting import until
 from tests.local.conftest import command, invoke
 from tests.local.data.drives import Agent

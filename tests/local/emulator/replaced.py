@@ -40,8 +40,8 @@ def seen(value: Any) -> str:
 def main() -> None:
     streams.install(Ledger(Path(sys.argv[1])))
     told, before = {}, names()
-    for name in fixes.NAMES:
-        fixes.close(name)
+    for name, close in fixes.every():
+        close()
         after = names()
         told[name] = {key: seen(before[key]) for key in sorted(before) if after[key] is not before[key]}
         before = after

@@ -10,7 +10,6 @@ import re
 import subprocess
 import sys
 import time
-from importlib import import_module
 
 import pytest
 from ministack import app
@@ -22,7 +21,6 @@ from local.emulator import fixes, package
 from local.emulator.fixes import invocations
 from testkit.waiting import GUARD_S
 
-FOLDER = ROOT / "local" / "emulator" / "fixes"
 FORM = re.compile(
     r"[^\n]+\.\n\n"
     r"AWS: (?P<aws>.+)\nministack: .+\nTest:\s+(?P<file>\S+)::(?P<test>\w+)\nPatch: (?P<patch>.+)",
@@ -30,19 +28,8 @@ FORM = re.compile(
 )
 
 
-def test_every_fix_is_installed():
-    functions = {
-        f"{path.stem}.{name}"
-        for path in FOLDER.glob("[!_]*.py")
-        for name in re.findall(r"^def close_(\w+)", path.read_text(), re.MULTILINE)
-    }
-    assert sorted(fixes.NAMES) == sorted(functions)
-
-
-@pytest.mark.parametrize("name", fixes.NAMES)
-def test_each_fix_is_documented(name):
-    module, function = name.split(".")
-    close = vars(import_module(f"local.emulator.fixes.{module}"))[f"close_{function}"]
+@pytest.mark.parametrize("close", [close for _, close in fixes.every()], ids=lambda close: close.__name__)
+def test_each_fix_is_documented(close):
     form = FORM.fullmatch(inspect.getdoc(close))
     assert form
     assert "https://" in form["aws"] or form["aws"].startswith("does not apply;")

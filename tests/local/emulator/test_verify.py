@@ -36,6 +36,7 @@ def target(embedded, tmp_path_factory):
     target.remove_robots(print)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("check", [one for one in ALL if not one.not_embedded], ids=lambda check: check.name)
 def test_the_embedded_cloud_answers_as_assumed_or_measured(target, check):
     answer = ask(check, target, time.monotonic, report.load().seen.get(check.name))

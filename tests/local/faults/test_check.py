@@ -13,7 +13,7 @@ from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.verbs import connectivity
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
-from local.network.proxy import FREEZE, REFUSE, Proxy
+from testkit.proxy import FREEZE, REFUSE, Proxy
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from iort_station.data.accounts import accounts
 from iort_station.fleet import identity, robots
 from iort_station.operations import audit
 from local.cloud import EmbeddedCloud
-from local.network.proxy import FREEZE, PASS, REFUSE, Proxy
+from testkit.proxy import FREEZE, PASS, REFUSE, Proxy
 from testkit.waiting import GUARD_S, until
 from tests.local.data.drives import RATE_HZ, Agent, counted, counter_log
 from tests.local.faults.test_uplink import set_status

@@ -147,35 +147,19 @@ def test_a_client_without_a_certificate_cannot_connect(embedded):
     assert answer == b"", "AWS ends the handshake"
 
 
-@pytest.mark.parametrize("status", ["REVOKED", "INACTIVE"])
-def test_an_inactive_certificate_cannot_connect(embedded, bundle, status):
-    car = bundle()
-    iot = embedded.cloud.client("iot")
+@pytest.mark.parametrize("change", ["REVOKED", "INACTIVE", "no thing", "no policy", "removed"])
+def test_a_robot_without_all_that_belongs_to_it_cannot_connect(embedded, bundle, change):
+    car, iot = bundle(), embedded.cloud.client("iot")
     (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
-    iot.update_certificate(certificateId=arn.rsplit("/", 1)[-1], newStatus=status)
+    if change == "no thing":
+        iot.detach_thing_principal(thingName=car.robot, principal=arn)
+    elif change == "no policy":
+        iot.detach_policy(policyName="iort-robot", target=arn)
+    elif change == "removed":
+        robots.remove(embedded.cloud, car.robot)
+    else:
+        iot.update_certificate(certificateId=arn.rsplit("/", 1)[-1], newStatus=change)
     refused(car.folder)
-
-
-def test_a_certificate_without_a_thing_cannot_connect(embedded, bundle):
-    car = bundle()
-    iot = embedded.cloud.client("iot")
-    (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
-    iot.detach_thing_principal(thingName=car.robot, principal=arn)
-    refused(car.folder)
-
-
-def test_a_certificate_without_a_policy_cannot_connect(embedded, bundle):
-    car = bundle()
-    iot = embedded.cloud.client("iot")
-    (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
-    iot.detach_policy(policyName="iort-robot", target=arn)
-    refused(car.folder)
-
-
-def test_a_removed_robot_cannot_connect(embedded, tmp_path):
-    bundle = robots.add(embedded.cloud, "isolated-removed", out=tmp_path)
-    robots.remove(embedded.cloud, bundle.robot)
-    refused(bundle.folder)
 
 
 def refused(folder: Path) -> None:

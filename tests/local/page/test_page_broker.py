@@ -13,8 +13,8 @@ from iort_contract.topics import LIVE, build_topic
 from iort_station.page import motion
 from iort_station.page.answers import actions, answers
 from iort_station.page.server import PageServer
-from local.network.proxy import PASS, REFUSE, Proxy
 from testkit.car import AgentProcess
+from testkit.proxy import PASS, REFUSE, Proxy
 from testkit.waiting import until
 from tests.browser import plain, show, shown
 

@@ -266,18 +266,6 @@ def test_a_part_address_accepts_only_its_content(robot, put):
     assert robot.ask(FileRequest(uuid.uuid4().hex, file, {2: rest})).have == ((2, 2),)
 
 
-@pytest.mark.parametrize("name", ["../other/x", "/etc/passwd", "a//b", ".ssh"])
-def test_a_file_name_outside_the_folder_is_rejected(robot, name):
-    envelope = json.loads(encode_file_request(request_for(CONTENT)))
-    envelope["file"]["name"] = name
-    # The name of another robot in the request has no effect.
-    envelope["robot"] = "another"
-    robot.publish(build_topic(PING, robot.name, FILE), json.dumps(envelope).encode())
-    answer = decode_file_answer(robot.next_message()[1])
-    assert answer.refused is not None
-    assert "file name" in answer.refused
-
-
 def test_a_robot_can_neither_request_nor_receive_for_another(robot):
     request = encode_file_request(request_for(CONTENT))
     assert robot.publish(build_topic(PING, "another", FILE), request) == "NOT_AUTHORIZED"

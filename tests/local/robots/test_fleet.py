@@ -49,18 +49,6 @@ def test_only_the_registered_machine_gets_its_name(embedded, tmp_path, iort):
     assert [one["id"] for one in shown["certificates"]] == [held.id]
 
 
-def test_a_claim_for_one_name_cannot_take_another(embedded, tmp_path):
-    identity.register(embedded.cloud, "other-name")
-    claim = identity.claim(embedded.cloud, "one-name", out=tmp_path)
-    refused = command("provision", "--config", claim, "--robot", "nobodys-name", status=1)
-    assert "AccessDenied" in refused.stderr
-    # Another claim cannot take the name that was opened for this one.
-    lasting = identity.claim(embedded.cloud, None, out=tmp_path / "lasting", lasting=True)
-    refused = command("provision", "--config", lasting, "--robot", "one-name", status=1)
-    assert "AccessDenied" in refused.stderr
-    command("provision", "--config", claim)
-
-
 def test_the_registry_follows_a_robot(embedded, bundle, iort):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50, "duration_s": 1}])
     command("--config", car.config)

@@ -26,7 +26,7 @@ from iort_agent.errors import AgentError
 from iort_agent.status import SOCKET, fetch
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
-from local.network.proxy import PASS, REFUSE, Proxy
+from testkit.proxy import PASS, REFUSE, Proxy
 from testkit.waiting import until
 from tests.local.conftest import embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process, ros_python  # noqa: F401 - a fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pysindy
 import pytest
 import ruptures
 import statsmodels.api as sm
@@ -114,6 +113,9 @@ def test_the_equation_of_motion() -> None:
         )
     speed, drives, brakes, gained, slips = np.array(states).T
     rolls = (speed > 0.5) & (slips == 0)
+    # It takes seconds to load, in each of the workers that collect this file.
+    import pysindy
+
     model = pysindy.SINDy(
         optimizer=pysindy.STLSQ(threshold=1e-3, alpha=0.0),
         feature_library=pysindy.PolynomialLibrary(degree=2, include_interaction=False),
