@@ -18,9 +18,9 @@ from iort_contract.catalog.streams import AGENT_STREAM, LOG_STREAM, OWN_STREAMS
 
 _log = logging.getLogger(__name__)
 
-# The longest delay of a silent stream's last live sample and last batch.
-_TICK_S = 0.2
-_RATES_S = 1.0
+# The longest delay of a silent stream's last live sample and last batch. What can wait is looked at once a
+# second: each part that is woken from a cold cache costs as much as ten samples.
+_TICK_S, _SLOW_S = 0.2, 1.0
 _TYPES_S = 3600.0
 _CLOSE_S = 5.0
 # A warm Lambda function answers well within this time.
@@ -54,6 +54,7 @@ class Runtime:
         self._asked = self._broken = False
         self._lock = threading.Lock()
         self._running = len(agent.sources)
+        self._measured = self._repeated = agent.clock.monotonic()
 
     def stop(self) -> None:
         """End the run in good order; may be called from any thread and from a signal handler."""
@@ -112,33 +113,37 @@ class Runtime:
         return 0 if delivered and not failed else 1
 
     def tick(self) -> None:
-        """Let streams and lanes do what is due; `run` calls it several times a second."""
-        self._send_log()
+        """Do what is due of what cannot wait; `run` calls it several times a second."""
         self.agent.streams.tick()
         self.agent.record.tick()
-        self.agent.viewers.tick()
         self.agent.live.tick()
-        self.agent.pings.tick()
         self.agent.shadow.tick()
-        self.agent.stop_file.tick()
+
+    def tick_slowly(self) -> None:
+        """Do what else is due; `run` calls it once a second."""
+        agent, metrics, now = self.agent, self.agent.config.metrics, self.agent.clock.monotonic()
+        self._send_log()
+        agent.viewers.tick()
+        agent.pings.tick()
+        agent.stop_file.tick()
+        agent.rates.update(agent.streams.counts())
+        agent.accounts.tick()
+        if now - self._repeated >= _TYPES_S:
+            self._repeated = now
+            agent.streams.repeat_types()
+        if metrics.enabled and now - self._measured >= metrics.every_s:
+            self._measured = now
+            self._measure()
 
     def _tick_until_stop(self) -> None:
-        agent, metrics = self.agent, self.agent.config.metrics
-        measured = rated = repeated = agent.clock.monotonic()
-        agent.accounts.tell()
-        while not agent.clock.wait(self._stop, _TICK_S):
+        clock = self.agent.clock
+        slow_at = self._measured = self._repeated = clock.monotonic()
+        self.agent.accounts.tell()
+        while not clock.wait(self._stop, _TICK_S):
             self.tick()
-            now = agent.clock.monotonic()
-            if now - rated >= _RATES_S:
-                rated = now
-                agent.rates.update(agent.streams.counts())
-            agent.accounts.tick()
-            if now - repeated >= _TYPES_S:
-                repeated = now
-                agent.streams.repeat_types()
-            if metrics.enabled and now - measured >= metrics.every_s:
-                measured = now
-                self._measure()
+            if clock.monotonic() >= slow_at:
+                slow_at = clock.monotonic() + _SLOW_S - _TICK_S / 2
+                self.tick_slowly()
 
     def _send_log(self) -> None:
         """Emit the agent's own warnings and errors. Where they are logged, a lane's lock may be held."""

@@ -334,7 +334,8 @@ class LiveLane:
 
     def _next_ms(self) -> int:
         """The time from a message of a stream to its next one."""
-        slowed_s = 1 / self.tempo.effective_hz if self.tempo.slowed and self.tempo.effective_hz else 0.0
+        _, effective_hz, slowed = self._meter.tempo
+        slowed_s = 1 / effective_hz if slowed and effective_hz else 0.0
         return min(MAX_NEXT_MS, math.ceil(max(self._period_s, slowed_s) * 1000))
 
 

@@ -31,7 +31,7 @@ _BUNCH_S = 1.0
 # The record lane's thread may wake up this much later than it was told.
 _LATE_S = 0.05
 _WINDOW_S = 1.0
-_ROUNDING_S = 1e-6
+_ROUNDING = 1e-6
 # Fixed header, packet id and properties of a PUBLISH, at most.
 _OVERHEAD_BYTES = 16
 
@@ -62,22 +62,26 @@ class _Bucket:
     def __init__(self, rates: Pair, depth_s: float) -> None:
         self.rates = rates
         self._depth_s = depth_s
-        self._left = [rate * depth_s for rate in rates]
+        self._left: Pair = (rates[0] * depth_s, rates[1] * depth_s)
 
     def refill(self, passed_s: float) -> None:
-        for i, rate in enumerate(self.rates):
-            self._left[i] = min(rate * self._depth_s, self._left[i] + passed_s * rate)
+        publishes, payloads = self.rates
+        self._left = (
+            min(publishes * self._depth_s, self._left[0] + passed_s * publishes),
+            min(payloads * self._depth_s, self._left[1] + passed_s * payloads),
+        )
 
     def take(self, size: int) -> None:
-        self._left[0] -= 1
-        self._left[1] -= size
+        self._left = (self._left[0] - 1, self._left[1] - size)
 
-    def delay_s(self) -> float:
-        """Seconds until the bucket has no debt."""
-        return max(-left / rate for left, rate in zip(self._left, self.rates))
+    def debt_s(self) -> float:
+        """Seconds until the bucket has no debt; below 0 if it has none."""
+        return max(-self._left[0] / self.rates[0], -self._left[1] / self.rates[1])
 
-    def covers(self, debt: Pair) -> bool:
-        return all(left >= -owed - _ROUNDING_S for left, owed in zip(self._left, debt))
+    def covers(self, debt_s: float, rates: Pair) -> bool:
+        """Whether its debt is at most so many seconds' worth of these rates."""
+        publishes, payloads = self._left
+        return publishes >= -rates[0] * debt_s - _ROUNDING and payloads >= -rates[1] * debt_s - _ROUNDING
 
 
 class _LastSecond:
@@ -133,10 +137,10 @@ class RateLimiter:
         size = _size(topic, len(payload))
         with self._lock:
             now = self._refill()
-            delay_s = max(self._all.delay_s(), self._second.delay_s(now, size, LIVE.most))
+            delay_s = max(self._all.debt_s(), self._second.delay_s(now, size, LIVE.most))
             if now > self._waits_until + _LATE_S:
                 self._waits_since = now
-            if delay_s > _ROUNDING_S:
+            if delay_s > _ROUNDING:
                 self._waits_until = now + delay_s + _LATE_S
                 return delay_s
             self._waits_until = now
@@ -154,8 +158,8 @@ class RateLimiter:
             # While a backlog drains, the record lane always leaves a debt.
             debt_s = max(priority.debt_s, STEADY.debt_s) if drains else priority.debt_s
             return (
-                self._all.covers(self._worth(debt_s))
-                and self._rest.covers(self._worth(priority.debt_s))
+                self._all.covers(debt_s, self.rates)
+                and self._rest.covers(priority.debt_s, self.rates)
                 and self._second.delay_s(now, _size(topic, payload_bytes), priority.most) <= 0
             )
 
@@ -173,22 +177,21 @@ class RateLimiter:
         passed_s, self._at = now - self._at, now
         self._all.refill(passed_s)
         drains = self._drains(now)
-        self._rest.rates = (self._rest_of(0, drains=drains), self._rest_of(1, drains=drains))
+        rates, need = self.rates, self._need
+        self._rest.rates = _rest(rates[0], need[0], drains=drains), _rest(rates[1], need[1], drains=drains)
         self._rest.refill(passed_s)
         return now
 
     def _drains(self, now: float) -> bool:
         return self._backlog or (now < self._waits_until and now - self._waits_since > _BUNCH_S)
 
-    def _rest_of(self, i: int, *, drains: bool) -> float:
-        rate = self.rates[i]
-        rest = rate - self._need[i]
-        if drains:
-            rest = min(rate * _DRAIN_SHARE, rest / 2)
-        return max(rest, rate * _LEAST_SHARE)
 
-    def _worth(self, seconds: float) -> Pair:
-        return (self.rates[0] * seconds, self.rates[1] * seconds)
+def _rest(rate: float, need: float, *, drains: bool) -> float:
+    """What the record lane leaves of a rate."""
+    rest = rate - need
+    if drains:
+        rest = min(rate * _DRAIN_SHARE, rest / 2)
+    return max(rest, rate * _LEAST_SHARE)
 
 
 def _size(topic: str, payload_bytes: int) -> int:

@@ -12,11 +12,13 @@ from __future__ import annotations
 import functools
 import importlib
 import logging
+import os
 import random
+import struct
 import sys
 import threading
 import xmlrpc.client
-from typing import Any, Mapping
+from typing import Any, Callable, Mapping
 
 from iort_agent.common.threads import Clock, Supervised, SystemClock
 from iort_agent.errors import SourceError
@@ -326,6 +328,7 @@ class Node:
             logging.getLogger(name).setLevel(level)
         rospy.core.add_preshutdown_hook(self._on_shutdown)
         master.mend(self._me)
+        _read_directly(self._hand_out)
         # The agent handles signals, names are resolved already, and /clock is of no use to the agent.
         rospy.init_node(
             self.base, argv=[self.base], disable_signals=True, disable_rosout=True, disable_rostime=True
@@ -360,8 +363,11 @@ class Node:
                 )
 
     def _deliver(self, message: Any, topic: str) -> None:
+        self._hand_out(topic, message._connection_header, message._buff)  # noqa: SLF001 - rospy's only names
+
+    def _hand_out(self, topic: str, header: Mapping[str, str], data: bytes) -> None:
         for handler in self._handlers[topic]:
-            handler(message._connection_header, message._buff)  # noqa: SLF001 - rospy's only names for them
+            handler(header, data)
 
     def _poll(self) -> None:
         try:
@@ -423,6 +429,40 @@ class Node:
         """Tell rospy of a topic's publishers as a master does: it connects to the unknown ones."""
         if uris:
             master.proxy(self._rospy.get_node_uri()).publisherUpdate("/master", topic, uris)
+
+
+def _read_directly(hand_out: Callable[[str, Mapping[str, str], bytes], None]) -> None:
+    """Let the rospy that is imported now hand a subscription's messages over as they are on the socket.
+
+    Its own way, over a buffer, an object and a list for each message, costs more than all that the agent
+    does with a message. It still connects, and reads what came together with a connection's header.
+    """
+    transports = importlib.import_module("rospy.impl.tcpros_base").TCPROSTransport
+    subscription = importlib.import_module("rospy.impl.tcpros_pubsub").TCPROSSub
+    ended: Any = importlib.import_module("rospy.exceptions").TransportTerminated
+    receive_once, read_size = transports.receive_once, struct.Struct("<I").unpack
+
+    def receive(transport: Any) -> list[Any]:
+        protocol, header = transport.protocol, transport.header
+        if not isinstance(protocol, subscription) or transport.read_buff.tell():
+            messages: list[Any] = receive_once(transport)
+            return messages
+        topic = protocol.resolved_name
+        # rospy may close its descriptor at any time, and the number may then be another file's.
+        with os.fdopen(os.dup(transport.socket.fileno()), "rb", protocol.buff_size) as stream:
+            while not transport.done:
+                head = stream.read(4)
+                size = read_size(head)[0] if len(head) == 4 else 1
+                data = stream.read(size)
+                if len(data) != size:
+                    raise ended("the publisher has closed the connection")
+                try:
+                    hand_out(topic, header, data)
+                except Exception:  # noqa: BLE001 - whatever a handler raises, the topic must be heard on
+                    _log.exception("topic %s: a message could not be taken", topic)
+        return []
+
+    transports.receive_once = receive
 
 
 def _connections(endpoint: Any) -> int:

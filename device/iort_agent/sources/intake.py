@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Optional
 
@@ -30,6 +31,9 @@ HEADER, ARRIVAL = "header", "arrival"
 # A stamp further from the wall clock comes from a clock that is not set, or from a simulation.
 BELIEVABLE_US = 3600 * 1_000_000
 _SILENT_S = 5.0
+# Messages that come faster are taken together, twenty times a second: the first one after a pause costs as
+# much as ten that follow it. That is often enough for the live lane's highest rate.
+_TOGETHER_US = 50_000
 # A topic changes its definition when somebody rebuilds a package, not all the time.
 _MAX_KINDS = 32
 _MAX_PUBLISHERS = 32
@@ -86,9 +90,29 @@ class Intake:
         # Publisher -> its connection, and the last message that came by it.
         self._latched: dict[str, tuple[Mapping[str, str], bytes]] = {}
         self._lock = threading.Lock()
+        # What `receive` has got, and when it was last taken.
+        self._inbox: deque[tuple[Mapping[str, str], bytes, int]] = deque()
+        self._inbox_lock = threading.Lock()
+        self._emptied_us = 0
         self._messages = self._seen = 0
         self._heard = clock.monotonic()
         self._silent = False
+
+    def receive(self, header: Mapping[str, str], data: bytes) -> None:
+        """Note a message that arrives now, and `take` it soon; the last one of a topic that falls silent waits
+        for `look`. Never raises."""
+        now_us = self._clock.now_us()
+        self._inbox.append((header, data, now_us))
+        # The clock may be set back.
+        if not 0 <= now_us - self._emptied_us < _TOGETHER_US:
+            self._emptied_us = now_us
+            self.take_received()
+
+    def take_received(self) -> None:
+        """Take what `receive` has got."""
+        with self._inbox_lock:
+            while self._inbox:
+                self.take(*self._inbox.popleft())
 
     def take(self, header: Mapping[str, str], data: bytes, arrival_us: int | None = None) -> None:
         """Take a message with the header of its connection; ``arrival_us`` is now unless given. Never
@@ -109,7 +133,8 @@ class Intake:
         if kind.stamped and self._config.time == HEADER:
             t_ns = stamp_ns(data)
             t_us = None if t_ns is None else t_ns // 1000
-        values = self._sample(kind, data)
+        whole = kind.whole if kind.decoder is None else None
+        values = RosMessage(data, whole) if whole is not None else self._sample(kind, data)
         if t_us is None or self.sim_time or not -BELIEVABLE_US < t_us - arrival_us < BELIEVABLE_US:
             if self._config.time == HEADER:
                 self._warn_of_stamp(t_us, arrival_us)
@@ -123,6 +148,7 @@ class Intake:
 
     def look(self, connections: int) -> None:
         """Log when the topic falls silent, and when it is heard again."""
+        self.take_received()
         now = self._clock.monotonic()
         if self._messages != self._seen:
             self._seen, self._heard = self._messages, now

@@ -20,7 +20,8 @@ from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, Emit, Finding, SourceCo
 from iort_agent.sources.intake import Intake
 from iort_contract.limits import ContractError
 
-_LOOK_S = 1.0
+# The longest delay of the last message of a topic that falls silent.
+_LOOK_S = 0.5
 _TOPIC = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
 _NODE = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
@@ -109,7 +110,7 @@ class Ros1Source:
                     node.resolve(topic), settings, emit=emit, clock=self._clock, large=settings.large
                 )
                 self._intakes[topic] = intake
-                node.subscribe(topic, intake.take)
+                node.subscribe(topic, intake.receive)
             node.start()
             while not self._clock.wait(stop, _LOOK_S):
                 if node.failed:
@@ -120,7 +121,8 @@ class Ros1Source:
                         intake.look(node.connections(topic))
         finally:
             for topic, intake in self._intakes.items():
-                node.unsubscribe(topic, intake.take)
+                node.unsubscribe(topic, intake.receive)
+                intake.take_received()
             node.close()
 
     def report(self) -> dict[str, Any]:

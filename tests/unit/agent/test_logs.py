@@ -173,7 +173,7 @@ def test_a_line_is_live_at_once_and_recorded() -> None:
     with logging_agent(uplink, clock) as agent:
         uplink.start()
         logging.getLogger("iort_agent.x").warning("the first")
-        Runtime(agent).tick()
+        Runtime(agent).tick_slowly()
         (live,) = payloads(uplink, LIVE)
         assert decode_live(live).sample["text"] == "the first"
         agent.streams.flush()
@@ -200,7 +200,7 @@ def test_a_failing_link_adds_few_lines() -> None:
         logging.getLogger("iort_agent.x").warning("the first")
         for _ in range(3000):
             clock.advance(0.2)
-            runtime.tick()
+            runtime.tick_slowly()
             agent.record.step()
             dispatcher.run_pending()
     # Each refusal of a batch of lines is a warning, too.

@@ -88,6 +88,8 @@ class Drive:
                 self.agent.pings.send(BROKER)
             if self._ms % TICK_MS == 0:
                 self.runtime.tick()
+            if self._ms % 1000 == 0:
+                self.runtime.tick_slowly()
             ready = bisect.bisect_right(self._acks, self.clock.monotonic())
             if ready:
                 del self._acks[:ready]
