@@ -51,8 +51,9 @@ def wire_column(name: str, column: Sequence[Any]) -> tuple[list[Value], int]:
     # Columns of one kind are checked as a whole, in C; a car and Lambda 2 do this for every batch.
     if kinds == {int} and min(column) >= _MIN_INT and max(column) <= _MAX_INT:
         return out, 0
-    if kinds == {float} and all(map(math.isfinite, column)) and not any(map(float.is_integer, column)):
-        return out, 0
+    if kinds == {float} and all(map(math.isfinite, column)):
+        whole = map(float.is_integer, column)
+        return [int(v) if w and -(2.0**53) < v < 2.0**53 else v for v, w in zip(column, whole)], 0
     if float in kinds:
         for i, value in enumerate(out):
             if type(value) is float:

@@ -99,8 +99,8 @@ class Intake:
         self._silent = False
 
     def receive(self, header: Mapping[str, str], data: bytes) -> None:
-        """Note a message that arrives now, and `take` it soon; the last one of a topic that falls silent waits
-        for `look`. Never raises."""
+        """Note a message that arrives now, and `take` it soon; of a topic that falls silent, with `look`.
+        Never raises."""
         now_us = self._clock.now_us()
         self._inbox.append((header, data, now_us))
         # The clock may be set back.
