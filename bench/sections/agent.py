@@ -3,6 +3,7 @@
 - the processor time a sample, of the agent (both lanes, the spool, TLS to the embedded cloud's broker) and of
   a bare subscriber of the same topic in the same run;
 - the memory at the start and at the end, and the samples lost;
+- the processor that the connected agent takes while no sample comes;
 - the delay from ROS publish to an MQTT subscriber over the live lane, beside a bare MQTT client's. This needs
   mosquitto: the embedded cloud's broker hands Basic Ingest messages to the rule and to no subscriber, as AWS
   IoT does.
@@ -11,6 +12,7 @@
 from __future__ import annotations
 
 import struct
+import subprocess
 import tempfile
 import time
 from dataclasses import asdict, dataclass
@@ -21,6 +23,7 @@ from bench.floors.mosquitto import ROBOT, Mosquitto, subscribed
 from bench.report import Report, Section
 from bench.ros.mixed_robot import CORE
 from bench.sections import Declared, Option
+from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.live import decode_live
@@ -79,9 +82,10 @@ def _stamp_us(message: bytes) -> int:
 
 
 RATES_HZ = (50, 1000)
-# The most: processor time and live delay as a multiple of the floor's in the same run, and memory.
-CPU_TIMES = {50: 3.5, 1000: 2.0}
-LIVE_TIMES, RSS_MB = 2.0, 80.0
+# The most: processor time and live delay as a multiple of the floor's in the same run, percent of a core
+# without samples, and memory.
+CPU_TIMES = {50: 2.5, 1000: 1.5}
+LIVE_TIMES, REST_PERCENT, RSS_MB = 2.0, 0.3, 80.0
 _CATCH_UP_S = 30.0
 
 
@@ -104,27 +108,42 @@ def run(target: Target, say: Say, *, duration: int, soak: int) -> Section:
     for rate_hz in (1000,) if soak else RATES_HZ:
         say(f"{rate_hz} Hz for {soak or duration} s")
         runs.append(_measure(target.cloud, python, rate_hz, soak or duration))
+    rest_percent = None if soak else _at_rest(target.cloud, python, duration)
     program = mosquitto.found()
     for rate_hz in RATES_HZ if program is not None and not soak else ():
         say(f"mosquitto, {rate_hz} Hz for {duration} s")
         live[rate_hz] = delays(str(program), python, rate_hz, duration)
-    section = report(runs, live)
+    section = report(runs, live, rest_percent)
     if program is None:
         section.notes.append("mosquitto is not installed (apt install mosquitto): the live lane is left out.")
     return section
 
 
+def _start(cloud: Cloud, robot: str, folder: Path, graph: RosGraph, *, live: str) -> subprocess.Popen[str]:
+    settings = {
+        "sources": [{"type": "ros1", "topics": {TOPIC: {"stream": VESC_STREAM, "time": "header"}}}],
+        "queue": {"path": "spool.db"},
+        "live": {"when": live},
+    }
+    bundle = robots.add(cloud, robot, out=folder, settings=settings)
+    return graph.start("iort_agent.cli", "run", "--config", bundle.config)
+
+
+def _at_rest(cloud: Cloud, python: str, seconds: int) -> float:
+    """Percent of a core that the connected agent takes while no sample comes."""
+    with tempfile.TemporaryDirectory() as name, RosGraph(python, Path(name)) as graph:
+        agent = _start(cloud, "bench-rest", Path(name), graph, live="watched")
+        # Its first account.
+        reached(lambda: any(audit.batches(cloud, "bench-rest", ACCOUNT_STREAM)), within_s=_CATCH_UP_S)
+        before, began = machine.usage_of(agent.pid).cpu_s, time.monotonic()
+        time.sleep(seconds)
+        return (machine.usage_of(agent.pid).cpu_s - before) / (time.monotonic() - began) * 100
+
+
 def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
     robot, count = f"bench-{rate_hz}", rate_hz * (seconds + _WARM_UP_S)
     with tempfile.TemporaryDirectory() as name, RosGraph(python, Path(name)) as graph:
-        topics = {TOPIC: {"stream": VESC_STREAM, "time": "header"}}
-        settings = {
-            "sources": [{"type": "ros1", "topics": topics}],
-            "queue": {"path": "spool.db"},
-            "live": {"when": "always"},
-        }
-        bundle = robots.add(cloud, robot, out=Path(name), settings=settings)
-        agent = graph.start("iort_agent.cli", "run", "--config", bundle.config)
+        agent = _start(cloud, robot, Path(name), graph, live="always")
         floor = graph.start("bench.floors.ros_floor", TOPIC)
         publisher = graph.publisher(CORE, seconds + _WARM_UP_S, rate_hz=rate_hz)
         publisher.ready()
@@ -149,8 +168,11 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
     return Run(rate_hz, count, lost, agent_us, floor_us, before[0].rss_mb, after[0].rss_mb)
 
 
-def report(runs: list[Run], live: dict[int, tuple[Spread, Spread]]) -> Section:
-    """Make the section of the runs, and of the live lane's delays beside the floor's, by rate."""
+def report(
+    runs: list[Run], live: dict[int, tuple[Spread, Spread]], rest_percent: float | None = None
+) -> Section:
+    """Make the section of the runs, of the live lane's delays beside the floor's, by rate, and of the
+    processor at rest."""
     section, rows = Section("agent", "The agent on a real ROS 1 graph"), []
     for run in runs:
         rate, ours, floor = f"at {run.rate_hz} Hz", run.agent_cpu_us, run.floor_cpu_us
@@ -161,6 +183,9 @@ def report(runs: list[Run], live: dict[int, tuple[Spread, Spread]]) -> Section:
         section.ratio(name, ours / floor, CPU_TIMES[run.rate_hz])
         section.ratio(f"agent's memory {rate}", run.rss_mb_last, RSS_MB, unit="MB")
         section.ratio(f"samples lost {rate}", run.lost, 0, unit=f"of {run.samples:,}")
+    if rest_percent is not None:
+        rows.append(["processor at rest, connected", f"{rest_percent:.2f} % of a core", ""])
+        section.ratio("agent's processor at rest", rest_percent, REST_PERCENT, unit="% of a core")
     for rate_hz, (agent_ms, floor_ms) in live.items():
         name = f"ROS publish to MQTT subscriber at {rate_hz} Hz, mosquitto"
         # To a hundredth of a ms: the two differ by no more.
@@ -170,6 +195,7 @@ def report(runs: list[Run], live: dict[int, tuple[Spread, Spread]]) -> Section:
     section.table("The agent", ["figure", "measured", "floor, same run"], rows)
     section.raw = {
         "runs": [asdict(run) for run in runs],
+        "rest_percent": rest_percent,
         "live_ms": {rate_hz: [asdict(spread) for spread in spreads] for rate_hz, spreads in live.items()},
     }
     return section
