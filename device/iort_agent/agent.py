@@ -167,7 +167,7 @@ class Agent:
         timed = [name for source in self.sources if not source.replayed for name in source.streams]
         return stream not in OWN_STREAMS and stream not in timed and any(s.replayed for s in self.sources)
 
-    def _drove(self, config: Config) -> Callable[[Mapping[str, Value]], None]:
+    def _drove(self, config: Config) -> Callable[[Mapping[str, Value]], object]:
         """Takes the samples of who drove; a source with a stream of this name goes first."""
         if any(DRIVE_STREAM in source.streams() for source in config.sources):
             return lambda _: None

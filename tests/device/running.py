@@ -45,10 +45,11 @@ class Running:
         except Exception as error:  # noqa: BLE001 - the test reads the error
             self.failed = error
 
-    def _emit(self, stream: str, t_us: int, values: Any) -> None:
+    def _emit(self, stream: str, t_us: int, values: Any, **_: bool) -> float:
         with self._more:
             if stream == TYPES_STREAM:
                 self.said.append(values)
-                return
-            self.samples.append((stream, t_us, values))
-            self._more.notify_all()
+            else:
+                self.samples.append((stream, t_us, values))
+                self._more.notify_all()
+        return 0.0

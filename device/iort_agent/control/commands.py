@@ -169,7 +169,7 @@ class Operator:
     """
 
     answer: Callable[[str, Command, str | None], None]
-    drove: Callable[[Mapping[str, Value]], None]
+    drove: Callable[[Mapping[str, Value]], object]
     settings_known: Callable[[], bool]
 
 

@@ -98,13 +98,13 @@ class Attachments:
     def around(self, emit: Emit) -> Emit:
         """An `Emit` that replaces the bytes of each sample first."""
 
-        def emit_attached(stream: str, t_us: int, values: Mapping[str, Any]) -> None:
+        def emit_attached(stream: str, t_us: int, values: Mapping[str, Any], *, more: bool = False) -> float:
             if isinstance(values, RosMessage):
                 if values.large:
                     values = self.attach_to_message(stream, t_us, values)
             elif any(isinstance(value, bytes) for value in values.values()):
                 values = self.attach_to_fields(stream, t_us, values)
-            emit(stream, t_us, values)
+            return emit(stream, t_us, values, more=more)
 
         return emit_attached
 

@@ -225,11 +225,20 @@ class LiveLane:
             self._serve(now)
             self._meter.set_rate(demand.rate_hz)
 
-    def offer(self, stream: str, t_us: int, values: Mapping[str, Value], *, urgent: bool = False) -> None:
-        """Take the newest sample of a stream; it replaces the one that waits."""
-        if not self.enabled:
-            return
+    def offer(
+        self,
+        stream: str,
+        t_us: int,
+        values: Mapping[str, Value],
+        *,
+        urgent: bool = False,
+        more: bool = False,
+    ) -> float:
+        """Take the newest sample of a stream; it replaces the one that waits. ``more`` and the result are
+        `iort_agent.sources.Emit`'s."""
         now = self._clock.monotonic()
+        if not self.enabled:
+            return now + _FASTEST_S
         with self._lock:
             slot = self._slots.get(stream)
             if slot is None:
@@ -240,9 +249,11 @@ class LiveLane:
             slot.urgent = urgent
             slot.t_us, slot.values, slot.newest, slot.offered = t_us, values, values, now
             slot.offers += 1
-            if now >= slot.due or slot.is_urgent(now):
+            if (now >= slot.due and not more) or slot.is_urgent(now):
                 self._take_turn(slot, now)
             self._serve(now)
+            # Another fault code may come at any time, and does not wait for a slow rate.
+            return min(slot.due, now + _FASTEST_S)
 
     def tick(self) -> None:
         """Send what waits since a stream fell silent or the connection was lost."""

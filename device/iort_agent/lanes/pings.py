@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from typing import Callable, NamedTuple, Sequence
+from typing import Callable, Mapping, NamedTuple, Sequence
 
 from iort_agent.common.state import ClockOffset, RoundTrips
 from iort_agent.common.threads import Clock, Pace
 from iort_agent.lanes import PingConfig
 from iort_agent.mqtt.rate_limiter import STEADY
 from iort_agent.mqtt.uplink import Link, MqttMessage
-from iort_agent.sources import Emit
 from iort_contract.catalog.streams import RTT_FIELDS, RTT_STREAM
 from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS, ContractError, Value
 from iort_contract.messages.live import decode_pong, encode_ping
@@ -28,6 +27,8 @@ _KEPT = 20_000
 
 # Takes a round trip through a rule: monotonic times of sending and receiving, and the cloud's stamp.
 OnStamp = Callable[[float, float, int], None]
+# Takes a sample, which is recorded only.
+Record = Callable[[str, int, Mapping[str, Value]], None]
 
 
 class _Path:
@@ -49,7 +50,7 @@ class Pings:
     ``on_stamp`` gets every round trip through a rule. If none is measured, one every `CLOCK_EVERY_S` is made
     for the clock offset. ``held_back`` counts the pings that the rate limiter did not let through."""
 
-    def __init__(self, link: Link, config: PingConfig, *, emit: Emit, on_stamp: OnStamp) -> None:
+    def __init__(self, link: Link, config: PingConfig, *, emit: Record, on_stamp: OnStamp) -> None:
         self._link, self._clock, self._uplink = link, link.clock, link.uplink
         self._emit, self._on_stamp = emit, on_stamp
         self._rate_hz, self._names = config.rate_hz, config.paths

@@ -219,19 +219,29 @@ class Streams:
         self._types: dict[tuple[Value, ...], Mapping[str, Value]] = {}
         self._fields: dict[str, Iterable[str]] = {}
 
-    def emit(self, stream: str, t_us: int, values: Mapping[str, Value], *, urgent: bool = False) -> None:
-        """Take a sample for both lanes; an ``urgent`` one waits for no slow rate of the live lane."""
+    def emit(
+        self,
+        stream: str,
+        t_us: int,
+        values: Mapping[str, Value],
+        *,
+        urgent: bool = False,
+        more: bool = False,
+    ) -> float:
+        """Take a sample for both lanes, as an `iort_agent.sources.Emit`; an ``urgent`` one waits for no slow
+        rate of the live lane."""
         if stream == TYPES_STREAM:
             # The live lane shows no message types.
             self._keep_type(values)
             self.record(stream, t_us, values)
-            return
+            return 0.0
         if self.settings.fields and stream in self.settings.fields:
             self._fields.setdefault(stream, values.keys())
             values = {name: values[name] for name in self.settings.fields[stream] if name in values}
         # First, because its delay counts.
-        self._live.offer(stream, t_us, values, urgent=urgent)
+        next_at = self._live.offer(stream, t_us, values, urgent=urgent, more=more)
         self.record(stream, t_us, values)
+        return next_at
 
     def record(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
         """Take a sample for the record lane only."""

@@ -4,7 +4,7 @@ source may use the ROS 1 node and the tools of all rooms; it knows no other room
 from __future__ import annotations
 
 import threading
-from typing import Any, Callable, Iterator, Mapping, NamedTuple, Protocol, Sequence
+from typing import Any, Iterator, Mapping, NamedTuple, Protocol, Sequence
 
 from iort_agent.common.threads import Clock
 from iort_contract.limits import Value
@@ -12,9 +12,20 @@ from iort_contract.limits import Value
 # Bytes in a message, such as an image: left out, or uploaded as a file with an attachment in the sample.
 REFUSE, UPLOAD = "refuse", "upload"
 
-# Takes a sample: stream, microseconds since the epoch, field -> value. The source must not change the mapping
-# afterwards. A value may be bytes if the source's configuration says `UPLOAD`. Never blocks, never raises.
-Emit = Callable[[str, int, Mapping[str, Value]], None]
+
+class Emit(Protocol):
+    """Takes a sample: stream, microseconds since the epoch, field -> value. The source must not change the
+    mapping afterwards. A value may be bytes if the source's configuration says `UPLOAD`. Never blocks, never
+    raises.
+
+    ``more`` tells that newer samples follow at once. Until the monotonic time that is returned, nobody misses
+    the stream's next samples.
+    """
+
+    def __call__(
+        self, stream: str, t_us: int, values: Mapping[str, Value], *, more: bool = False
+    ) -> float: ...
+
 
 OK, WARN, FAIL = "ok", "warn", "fail"
 

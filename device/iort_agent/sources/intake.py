@@ -31,9 +31,6 @@ HEADER, ARRIVAL = "header", "arrival"
 # A stamp further from the wall clock comes from a clock that is not set, or from a simulation.
 BELIEVABLE_US = 3600 * 1_000_000
 _SILENT_S = 5.0
-# Messages that come faster are taken together, twenty times a second: the first one after a pause costs as
-# much as ten that follow it. That is often enough for the live lane's highest rate.
-_TOGETHER_US = 50_000
 # A topic changes its definition when somebody rebuilds a package, not all the time.
 _MAX_KINDS = 32
 _MAX_PUBLISHERS = 32
@@ -90,33 +87,34 @@ class Intake:
         # Publisher -> its connection, and the last message that came by it.
         self._latched: dict[str, tuple[Mapping[str, str], bytes]] = {}
         self._lock = threading.Lock()
-        # What `receive` has got, and when it was last taken.
+        # What `receive` has got, and until when it may stay there.
         self._inbox: deque[tuple[Mapping[str, str], bytes, int]] = deque()
         self._inbox_lock = threading.Lock()
-        self._emptied_us = 0
+        self._due = 0.0
         self._messages = self._seen = 0
         self._heard = clock.monotonic()
         self._silent = False
 
     def receive(self, header: Mapping[str, str], data: bytes) -> None:
-        """Note a message that arrives now, and `take` it soon; of a topic that falls silent, with `look`.
-        Never raises."""
-        now_us = self._clock.now_us()
-        self._inbox.append((header, data, now_us))
-        # The clock may be set back.
-        if not 0 <= now_us - self._emptied_us < _TOGETHER_US:
-            self._emptied_us = now_us
+        """Note a message that arrives now. It is taken with those before it, when the live lane wants one:
+        the first one after a pause costs as much as ten that follow it at once. Of a topic that falls silent,
+        `look` takes them. Never raises."""
+        self._inbox.append((header, data, self._clock.now_us()))
+        if self._clock.monotonic() >= self._due:
             self.take_received()
 
     def take_received(self) -> None:
         """Take what `receive` has got."""
         with self._inbox_lock:
             while self._inbox:
-                self.take(*self._inbox.popleft())
+                header, data, arrival_us = self._inbox.popleft()
+                self.take(header, data, arrival_us, more=bool(self._inbox))
 
-    def take(self, header: Mapping[str, str], data: bytes, arrival_us: int | None = None) -> None:
-        """Take a message with the header of its connection; ``arrival_us`` is now unless given. Never
-        raises."""
+    def take(
+        self, header: Mapping[str, str], data: bytes, arrival_us: int | None = None, *, more: bool = False
+    ) -> None:
+        """Take a message with the header of its connection; ``arrival_us`` is now unless given, and ``more``
+        tells that others follow at once. Never raises."""
         if arrival_us is None:
             arrival_us = self._clock.now_us()
         if header.get("latching") == "1" and self._came_before(header, data):
@@ -140,7 +138,7 @@ class Intake:
                 self._warn_of_stamp(t_us, arrival_us)
             t_us = arrival_us
         if values is not None:
-            self._emit(self._config.stream, t_us, values)
+            self._due = self._emit(self._config.stream, t_us, values, more=more)
 
     def warn(self, reason: str, why: str) -> None:
         """Count and log something about the topic's messages."""

@@ -27,14 +27,17 @@ class Desk:
         self.clock = ManualClock(now_us=T0)
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
         self.types: list[MessageType] = []
+        # Until when the live lane wants none.
+        self.next_at = 0.0
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
         self.intake = Intake("/t", config, emit=self._emit, clock=self.clock, large=config.large)
 
-    def _emit(self, stream: str, t_us: int, values: Any) -> None:
+    def _emit(self, stream: str, t_us: int, values: Any, **_: bool) -> float:
         if stream != TYPES_STREAM:
             self.samples.append((stream, t_us, values))
         else:
             self.types.append(message_type(values))
+        return self.next_at
 
     def take(self, data: bytes, **header: str) -> None:
         self.intake.take({**CONNECTION, **header}, data)
