@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Iterable
 from contextlib import suppress
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from testkit import ROOT
 
@@ -104,6 +105,25 @@ def threads_ns(pids: Iterable[int]) -> dict[int, int]:
         # A thread may end meanwhile.
         with suppress(OSError, IndexError):
             found[int(file.parent.name)] = int(file.read_text().split()[0])
+    return found
+
+
+class Threads(NamedTuple):
+    """The threads of one name: their processor time in seconds, and how often they have waited."""
+
+    cpu_s: float = 0.0
+    waits: int = 0
+
+
+def threads_of(pid: int) -> dict[str, Threads]:
+    """Return what the threads of a process have taken so far, by their names in the kernel."""
+    found: dict[str, Threads] = {}
+    for folder in Path(f"/proc/{pid}/task").iterdir():
+        name, status = ((folder / file).read_text() for file in ("comm", "status"))
+        cpu_s = int((folder / "schedstat").read_text().split()[0]) / 1e9
+        waits = int(re.findall(r"^voluntary_ctxt_switches:\s*(\d+)", status, re.MULTILINE)[0])
+        before = found.get(name.strip(), Threads())
+        found[name.strip()] = Threads(before.cpu_s + cpu_s, before.waits + waits)
     return found
 
 

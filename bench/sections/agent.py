@@ -2,6 +2,7 @@
 
 - the processor time a sample, of the agent (both lanes, the spool, TLS to the embedded cloud's broker) and of
   a bare subscriber of the same topic in the same run;
+- what each thread of the agent takes of it, and how often it wakes up;
 - the memory at the start and at the end, and the samples lost;
 - the processor that the connected agent takes while no sample comes;
 - the delay from ROS publish to an MQTT subscriber over the live lane, beside a bare MQTT client's. This needs
@@ -87,6 +88,7 @@ RATES_HZ = (50, 1000)
 CPU_TIMES = {50: 2.5, 1000: 1.5}
 LIVE_TIMES, REST_PERCENT, RSS_MB = 2.0, 0.3, 80.0
 _CATCH_UP_S = 30.0
+_NONE = machine.Threads()
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,8 @@ class Run:
     lost: int
     agent_cpu_us: float
     floor_cpu_us: float
+    # Of each thread of the agent: us a sample, and wake-ups a second.
+    threads: dict[str, tuple[float, float]]
     rss_mb_first: float
     rss_mb_last: float
 
@@ -149,10 +153,12 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
         publisher.ready()
         publisher.go()
         publisher.publish_for(_WARM_UP_S)
-        before, began = [machine.usage_of(process.pid) for process in (agent, floor)], time.monotonic()
+        before, began = [machine.threads_of(process.pid) for process in (agent, floor)], time.monotonic()
+        rss_mb = machine.usage_of(agent.pid).rss_mb
         publisher.publish_for(seconds - 1)
-        measured = (time.monotonic() - began) * rate_hz
-        after = [machine.usage_of(process.pid) for process in (agent, floor)]
+        took_s = time.monotonic() - began
+        after = [machine.threads_of(process.pid) for process in (agent, floor)]
+        rss_mb_last = machine.usage_of(agent.pid).rss_mb
         publisher.finish()
 
         def stored() -> int:
@@ -162,10 +168,18 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
         lost = count - stored()
         agent.terminate()
         agent.wait()
-    agent_us, floor_us = (
-        (then.cpu_s - first.cpu_s) / measured * 1e6 for first, then in zip(before, after, strict=True)
+    ours, floors = (
+        {
+            name: (
+                (now.cpu_s - then.get(name, _NONE).cpu_s) / (took_s * rate_hz) * 1e6,
+                (now.waits - then.get(name, _NONE).waits) / took_s,
+            )
+            for name, now in threads.items()
+        }
+        for then, threads in zip(before, after, strict=True)
     )
-    return Run(rate_hz, count, lost, agent_us, floor_us, before[0].rss_mb, after[0].rss_mb)
+    agent_us, floor_us = (sum(us for us, _ in threads.values()) for threads in (ours, floors))
+    return Run(rate_hz, count, lost, agent_us, floor_us, ours, rss_mb, rss_mb_last)
 
 
 def report(
@@ -193,6 +207,14 @@ def report(
         if agent_ms.p50 and floor_ms.p50:
             section.ratio(f"{name} / floor", agent_ms.p50 / floor_ms.p50, LIVE_TIMES)
     section.table("The agent", ["figure", "measured", "floor, same run"], rows)
+    section.table(
+        "Its threads, `python` being those of rospy",
+        ["thread", *(f"us a sample, wake-ups a second at {run.rate_hz} Hz" for run in runs)],
+        [
+            [name, *("{:.1f}, {:.1f}".format(*run.threads.get(name, (0.0, 0.0))) for run in runs)]
+            for name in sorted(runs[0].threads, key=runs[0].threads.__getitem__, reverse=True)
+        ],
+    )
     section.raw = {
         "runs": [asdict(run) for run in runs],
         "rest_percent": rest_percent,

@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 # The longest delay of a silent stream's last live sample and last batch. What can wait is looked at once a
 # second: each part that is woken from a cold cache costs as much as ten samples.
-_TICK_S, _SLOW_S = 0.2, 1.0
+_TICK_S, _SLOW_S = 0.5, 1.0
 _TYPES_S = 3600.0
 _CLOSE_S = 5.0
 # A warm Lambda function answers well within this time.

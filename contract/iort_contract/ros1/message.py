@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from typing import Iterator, Mapping, NamedTuple, Sequence
+from typing import Any, Iterator, Mapping, NamedTuple, Sequence, ValuesView
 
 from iort_contract.checks import COMPACT, json_object, shown
 from iort_contract.limits import MAX_COLUMNS_BYTES, MAX_SERIALIZED_BYTES, ContractError, MessageError, Value
@@ -76,6 +76,14 @@ class RosMessage(Mapping[str, Value]):
 
     def __len__(self) -> int:
         return len(self._sample())
+
+    # `Mapping` has these, too, in steps for each field: half of what a live message takes.
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self._sample().get(name, default)
+
+    def values(self) -> ValuesView[Value]:
+        return self._sample().values()
 
     def _sample(self) -> Mapping[str, Value]:
         if self._values is None:

@@ -22,6 +22,8 @@ import logging
 import os
 import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 from typing import Callable, NamedTuple, Protocol
 
 _log = logging.getLogger(__name__)
@@ -181,6 +183,9 @@ class Supervised:
 
     def _run(self) -> None:
         wait_s = FIRST_S
+        with suppress(OSError):  # not Linux
+            # `top -H` shows it; Python tells the kernel no names.
+            Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_text(self.name, encoding="utf-8")
         try:
             while True:
                 began = self._clock.monotonic()

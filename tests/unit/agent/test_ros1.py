@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import socket
+import struct
 import sys
 import threading
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iort_agent.ros1 import master
+from iort_agent.ros1 import master, node
 from iort_agent.ros1.json_message import Writer, decode, encode
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import parse
@@ -266,3 +269,54 @@ def test_a_publisher_that_did_not_answer_is_tried_again(rospy: Any, monkeypatch:
 def test_a_topic_without_subscriber_is_not_connected(rospy: Any) -> None:
     rospy.connect("/other")
     assert rospy.connections == []
+
+
+class Subscription(SimpleNamespace):
+    """rospy's protocol of a subscription."""
+
+
+class Transport:
+    """rospy's connection to a publisher. By itself it reads what came with the connection's header."""
+
+    done = False
+    header = MappingProxyType({"callerid": "/pub"})
+
+    def __init__(self, protocol: Any, early: bytes = b"") -> None:
+        self.protocol, self.read_buff = protocol, io.BytesIO()
+        self.read_buff.write(early)
+        self.socket: socket.socket | None = None
+
+    def receive_once(self) -> list[bytes]:
+        return [self.read_buff.getvalue()]
+
+
+def test_messages_are_handed_over_as_they_are_on_the_socket(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    taken: list[Any] = []
+
+    def take(*message: Any) -> None:
+        taken.append(message)
+        assert message[-1] != b"bad"
+
+    transports = type("Transports", (Transport,), {})
+    for name, module in (
+        ("impl.tcpros_base", SimpleNamespace(TCPROSTransport=transports)),
+        ("impl.tcpros_pubsub", SimpleNamespace(TCPROSSub=Subscription)),
+        ("exceptions", SimpleNamespace(TransportTerminated=EOFError)),
+    ):
+        monkeypatch.setitem(sys.modules, f"rospy.{name}", module)
+    node._read_directly(take)
+    messages = [b"one", b"", b"bad", b"x" * 1000]
+    transport = transports(Subscription(resolved_name=TOPIC, buff_size=100))
+    publisher, transport.socket = socket.socketpair()
+    with transport.socket:
+        with publisher:
+            publisher.sendall(b"".join(struct.pack("<I", len(data)) + data for data in messages) + b"\x09\0")
+        with pytest.raises(EOFError):
+            transport.receive_once()
+    assert taken == [(TOPIC, Transport.header, data) for data in messages]
+    assert "a message could not be taken" in caplog.text
+    # rospy's own way for what came with the header, and for a service.
+    assert transports(Subscription(), early=b"rest").receive_once() == [b"rest"]
+    assert transports(SimpleNamespace()).receive_once() == [b""]

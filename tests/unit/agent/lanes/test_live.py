@@ -64,6 +64,24 @@ def test_50_hz_becomes_10_hz_without_waiting() -> None:
     assert [live.seq for live in rig.sent()] == list(range(len(rig.sent())))
 
 
+def test_of_samples_that_come_together_the_newest_is_sent() -> None:
+    rig = Rig()
+    for speed in range(3):
+        next_at = rig.lane.offer("vesc", rig.clock.now_us(), {"speed": speed}, more=speed < 2)
+    assert rig.speeds() == [2]
+    assert rig.clock.monotonic() < next_at <= rig.clock.monotonic() + 0.1
+
+
+def test_another_fault_code_among_samples_that_come_together_is_sent() -> None:
+    rig = Rig(rate_hz=0.1)
+    rig.offer(0)
+    rig.clock.advance(1)
+    for code in (0, 3, 0):
+        next_at = rig.lane.offer("vesc", rig.clock.now_us(), {"fault_code": code}, more=True)
+    assert [live.sample.get("fault_code") for live in rig.sent()] == [None, 0]
+    assert next_at == pytest.approx(rig.clock.monotonic() + 0.1), "whatever the rate is"
+
+
 def test_slightly_late_samples_do_not_lower_the_rate() -> None:
     rig = Rig()
     for i in range(400):

@@ -27,20 +27,45 @@ class Desk:
         self.clock = ManualClock(now_us=T0)
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
         self.types: list[MessageType] = []
+        self.more: list[bool] = []
         # Until when the live lane wants none.
         self.next_at = 0.0
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
         self.intake = Intake("/t", config, emit=self._emit, clock=self.clock, large=config.large)
 
-    def _emit(self, stream: str, t_us: int, values: Any, **_: bool) -> float:
+    def _emit(self, stream: str, t_us: int, values: Any, *, more: bool = False) -> float:
         if stream != TYPES_STREAM:
             self.samples.append((stream, t_us, values))
+            self.more.append(more)
         else:
             self.types.append(message_type(values))
         return self.next_at
 
     def take(self, data: bytes, **header: str) -> None:
         self.intake.take({**CONNECTION, **header}, data)
+
+
+def test_messages_wait_until_the_live_lane_wants_one() -> None:
+    desk = Desk(time="arrival")
+    desk.next_at, header = desk.clock.monotonic() + 0.1, {**CONNECTION, "message_definition": "uint8 u"}
+    for data in (b"\x00", b"\x01", b"\x02"):
+        desk.intake.receive(header, data)
+        desk.clock.advance(0.04)
+    assert len(desk.samples) == 1
+    desk.intake.receive(header, b"\x03")
+    assert [(t_us - T0, values["u"]) for _, t_us, values in desk.samples] == [
+        (i * 40_000, i) for i in range(4)
+    ]
+    assert desk.more == [False, True, True, False]
+
+
+def test_the_last_message_of_a_silent_topic_waits_for_the_next_look() -> None:
+    desk = Desk(time="arrival")
+    desk.next_at = desk.clock.monotonic() + 0.1
+    desk.intake.receive(CONNECTION, b"\x00")
+    desk.intake.receive(CONNECTION, b"\x01")
+    desk.intake.look(1)
+    assert len(desk.samples) == 2
 
 
 def test_a_publishers_type_is_said_when_it_connects() -> None:
