@@ -56,7 +56,13 @@ def packed_samples(
 
     Raises `ContractError` if they are too large.
     """
-    columns = {name: packed(column) for name, column in fields.items()}
+    return written_samples(dt, {name: packed(column) for name, column in fields.items()}, behind, codec)
+
+
+def written_samples(
+    dt: Sequence[int], columns: Mapping[str, Sequence[Value]], behind: bytes = b"", codec: str = CODEC
+) -> str:
+    """As `packed_samples`, of columns that are `packed` already."""
     text = COMPACT.encode({"dt": dt, "fields": columns})
     if len(text) > _MOST_BYTES[CODEC]:
         raise ContractError(f"columns of a batch must be at most {_MOST_BYTES[CODEC]} bytes, got {len(text)}")

@@ -29,6 +29,7 @@ from iort_contract.codec import (
     inflate,
     packed_samples,
     unpacked,
+    written_samples,
 )
 from iort_contract.limits import (
     BATCH_VERSION,
@@ -223,7 +224,7 @@ def _packed_messages(
     numbers = None if beside else as_columns(messages, times)
     if numbers is not None:
         columns, about = numbers
-        return CODEC, packed_samples(dt, columns, about.encode())
+        return CODEC, written_samples(dt, columns, about.encode())
     return SERIALIZED_CODEC, packed_samples(dt, beside, pack(messages), SERIALIZED_CODEC)
 
 

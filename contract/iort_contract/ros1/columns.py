@@ -95,8 +95,8 @@ def _walked(decoder: Decoder, raws: Sequence[bytes]) -> dict[str, list[Value]]:
 
 
 def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, list[Value]], str] | None:
-    """Messages as columns for the wire, and the rest needed to rebuild them, as JSON. None if the messages
-    are better stored unchanged."""
+    """Messages as `packed` columns, and the rest needed to rebuild them, as JSON. None if the messages are
+    better stored unchanged."""
     if not messages.layout:
         return None
     decoder = decoder_of(messages.layout)
@@ -104,10 +104,12 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
     if numbers is None or max(map(len, numbers.names)) > MAX_FIELD_CHARACTERS:
         return None
     columns: dict[str, list[Value]] = {}
+    written: dict[str, list[Value]] = {}
     for name, column in numbers.columns().items():
         columns[name] = wire_column(name, column)[0]
+        written[name] = packed(columns[name])
         # Numbers that are not steps take more as text than as bytes.
-        if float in set(map(type, columns[name])) and packed(columns[name])[0] is None:
+        if written[name][0] is None and float in set(map(type, columns[name])):
             return None
     if numbers.rows != _rows(numbers.struct, numbers.names, columns):
         return None
@@ -126,7 +128,7 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
         about.append(seqs[0] if seqs == list(range(seqs[0], seqs[0] + len(seqs))) else packed(seqs))
         about.append(_digits(offsets) or packed(offsets))
         about.append(texts if len(set(texts)) > 1 else texts[0])
-    return columns, COMPACT.encode(about)
+    return written, COMPACT.encode(about)
 
 
 def from_columns(
