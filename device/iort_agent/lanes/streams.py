@@ -101,7 +101,7 @@ class BatchEncoder:
     def counts(self) -> StreamCounts:
         """The counts of one moment."""
         with self._lock:
-            return replace(self._counts)
+            return StreamCounts(*vars(self._counts).values())
 
     def tick(self) -> None:
         """Close the batches of a topic that has fallen silent."""

@@ -32,6 +32,8 @@ _BUNCH_S = 1.0
 _LATE_S = 0.05
 _WINDOW_S = 1.0
 _ROUNDING = 1e-6
+# Buckets are filled in steps of this length: a message asks first, and is charged when it is made.
+_STEP_S = 1e-3
 # Fixed header, packet id and properties of a PUBLISH, at most.
 _OVERHEAD_BYTES = 16
 
@@ -174,7 +176,10 @@ class RateLimiter:
 
     def _refill(self) -> float:
         now = self._clock.monotonic()
-        passed_s, self._at = now - self._at, now
+        passed_s = now - self._at
+        if passed_s < _STEP_S:
+            return now
+        self._at = now
         self._all.refill(passed_s)
         drains = self._drains(now)
         rates, need = self.rates, self._need

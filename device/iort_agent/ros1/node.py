@@ -18,7 +18,7 @@ import struct
 import sys
 import threading
 import xmlrpc.client
-from typing import Any, Callable, Mapping
+from typing import Any, Mapping, Sequence
 
 from iort_agent.common.threads import Clock, Supervised, SystemClock
 from iort_agent.errors import SourceError
@@ -328,7 +328,7 @@ class Node:
             logging.getLogger(name).setLevel(level)
         rospy.core.add_preshutdown_hook(self._on_shutdown)
         master.mend(self._me)
-        _read_directly(self._hand_out)
+        _read_directly(self._handlers)
         # The agent handles signals, names are resolved already, and /clock is of no use to the agent.
         rospy.init_node(
             self.base, argv=[self.base], disable_signals=True, disable_rosout=True, disable_rostime=True
@@ -363,11 +363,8 @@ class Node:
                 )
 
     def _deliver(self, message: Any, topic: str) -> None:
-        self._hand_out(topic, message._connection_header, message._buff)  # noqa: SLF001 - rospy's only names
-
-    def _hand_out(self, topic: str, header: Mapping[str, str], data: bytes) -> None:
         for handler in self._handlers[topic]:
-            handler(header, data)
+            handler(message._connection_header, message._buff)  # noqa: SLF001 - rospy's only names for them
 
     def _poll(self) -> None:
         try:
@@ -431,8 +428,8 @@ class Node:
             master.proxy(self._rospy.get_node_uri()).publisherUpdate("/master", topic, uris)
 
 
-def _read_directly(hand_out: Callable[[str, Mapping[str, str], bytes], None]) -> None:
-    """Let the rospy that is imported now hand a subscription's messages over as they are on the socket.
+def _read_directly(handlers: Mapping[str, Sequence[OnBytes]]) -> None:
+    """Let the rospy that is imported now hand a topic's messages to its handlers as they are on the socket.
 
     Its own way, over a buffer, an object and a list for each message, costs more than all that the agent
     does with a message. It still connects, and reads what came together with a connection's header.
@@ -447,7 +444,7 @@ def _read_directly(hand_out: Callable[[str, Mapping[str, str], bytes], None]) ->
         if not isinstance(protocol, subscription) or transport.read_buff.tell():
             messages: list[Any] = receive_once(transport)
             return messages
-        topic = protocol.resolved_name
+        takers = handlers[protocol.resolved_name]
         # rospy may close its descriptor at any time, and the number may then be another file's.
         with os.fdopen(os.dup(transport.socket.fileno()), "rb", protocol.buff_size) as stream:
             while not transport.done:
@@ -457,9 +454,10 @@ def _read_directly(hand_out: Callable[[str, Mapping[str, str], bytes], None]) ->
                 if len(data) != size:
                     raise ended("the publisher has closed the connection")
                 try:
-                    hand_out(topic, header, data)
+                    for take in takers:
+                        take(header, data)
                 except Exception:  # noqa: BLE001 - whatever a handler raises, the topic must be heard on
-                    _log.exception("topic %s: a message could not be taken", topic)
+                    _log.exception("topic %s: a message could not be taken", protocol.resolved_name)
         return []
 
     transports.receive_once = receive

@@ -146,8 +146,9 @@ class Intake:
 
     def look(self, connections: int) -> None:
         """Log when the topic falls silent, and when it is heard again."""
-        self.take_received()
         now = self._clock.monotonic()
+        if now >= self._due:
+            self.take_received()
         if self._messages != self._seen:
             self._seen, self._heard = self._messages, now
             if self._silent:

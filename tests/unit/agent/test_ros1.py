@@ -295,9 +295,9 @@ def test_messages_are_handed_over_as_they_are_on_the_socket(
 ) -> None:
     taken: list[Any] = []
 
-    def take(*message: Any) -> None:
-        taken.append(message)
-        assert message[-1] != b"bad"
+    def take(header: Any, data: bytes) -> None:
+        taken.append((header, data))
+        assert data != b"bad"
 
     transports = type("Transports", (Transport,), {})
     for name, module in (
@@ -306,7 +306,7 @@ def test_messages_are_handed_over_as_they_are_on_the_socket(
         ("exceptions", SimpleNamespace(TransportTerminated=EOFError)),
     ):
         monkeypatch.setitem(sys.modules, f"rospy.{name}", module)
-    node._read_directly(take)
+    node._read_directly({TOPIC: [take]})
     messages = [b"one", b"", b"bad", b"x" * 1000]
     transport = transports(Subscription(resolved_name=TOPIC, buff_size=100))
     publisher, transport.socket = socket.socketpair()
@@ -315,7 +315,7 @@ def test_messages_are_handed_over_as_they_are_on_the_socket(
             publisher.sendall(b"".join(struct.pack("<I", len(data)) + data for data in messages) + b"\x09\0")
         with pytest.raises(EOFError):
             transport.receive_once()
-    assert taken == [(TOPIC, Transport.header, data) for data in messages]
+    assert taken == [(Transport.header, data) for data in messages]
     assert "a message could not be taken" in caplog.text
     # rospy's own way for what came with the header, and for a service.
     assert transports(Subscription(), early=b"rest").receive_once() == [b"rest"]

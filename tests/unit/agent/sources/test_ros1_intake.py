@@ -65,6 +65,9 @@ def test_the_last_message_of_a_silent_topic_waits_for_the_next_look() -> None:
     desk.intake.receive(CONNECTION, b"\x00")
     desk.intake.receive(CONNECTION, b"\x01")
     desk.intake.look(1)
+    assert len(desk.samples) == 1
+    desk.clock.advance(0.5)
+    desk.intake.look(1)
     assert len(desk.samples) == 2
 
 

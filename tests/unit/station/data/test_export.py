@@ -188,11 +188,12 @@ def stored(play: Callable[[Emit, ManualClock], None]) -> Any:
     clock, spool = ManualClock(now_us=T0_US), MemorySpool(max_bytes=2**30)
     encoders: dict[str, BatchEncoder] = {}
 
-    def emit(stream: str, t_us: int, values: Any) -> None:
+    def emit(stream: str, t_us: int, values: Any, **_: bool) -> float:
         if stream not in encoders:
             boot = "0badcafe0badcafe"
             encoders[stream] = BatchEncoder(stream, boot=boot, batch_s=1, spool=spool, clock=clock)
         encoders[stream].add(t_us, values)
+        return 0.0
 
     play(emit, clock)
     for encoder in encoders.values():
