@@ -100,7 +100,7 @@ def test_a_message_is_restored_with_its_contents(tmp_path, every_s):
 def test_selected_fields_can_be_attached(tmp_path):
     out = []
     attachments = attachments_in(tmp_path)
-    emit = attachments.around(lambda *sample: out.append(sample))
+    emit = attachments.around(lambda *sample, more: out.append(sample))
     emit("camera", T_US, {"format": "jpeg", "data": PICTURE})
     ((_, _, sample),) = out
     assert sample.keys() == {"format", *(f"data.{name}" for name in ATTACHMENT_FIELDS)}
@@ -157,7 +157,7 @@ def test_waiting_for_the_folder_to_be_uploaded(tmp_path):
 
 def test_only_bytes_are_attached(tmp_path):
     out = []
-    emit = attachments_in(tmp_path).around(lambda *sample: out.append(sample))
+    emit = attachments_in(tmp_path).around(lambda *sample, more: out.append(sample))
     values = {"speed": 1.0, "text": "b"}
     emit("vesc", T_US, values)
     emit("camera", T_US, message := RosMessage(image(b"").raw, IMAGE))
@@ -216,7 +216,7 @@ def test_a_content_whose_bytes_are_in_the_stamp_too_is_cut_out_of_its_array(tmp_
 def play(path, **settings):
     out = []
     source = BagConfig(path=path, topics=((TOPIC, "camera"),), **settings).build(ManualClock())
-    source.run(lambda *sample: out.append(sample), threading.Event())
+    source.run(lambda *sample, more: out.append(sample), threading.Event())
     # Without the stream of message types.
     return [sample for sample in out if sample[0] == "camera"]
 
