@@ -112,7 +112,10 @@ def run(target: Target, say: Say, *, duration: int, soak: int) -> Section:
     for rate_hz in (1000,) if soak else RATES_HZ:
         say(f"{rate_hz} Hz for {soak or duration} s")
         runs.append(_measure(target.cloud, python, rate_hz, soak or duration))
-    rest_percent = None if soak else _at_rest(target.cloud, python, duration)
+    rest_percent = None
+    if not soak:
+        say(f"at rest for {duration} s")
+        rest_percent = _at_rest(target.cloud, python, duration)
     program = mosquitto.found()
     for rate_hz in RATES_HZ if program is not None and not soak else ():
         say(f"mosquitto, {rate_hz} Hz for {duration} s")
@@ -139,9 +142,13 @@ def _at_rest(cloud: Cloud, python: str, seconds: int) -> float:
         agent = _start(cloud, "bench-rest", Path(name), graph, live="watched")
         # Its first account.
         reached(lambda: any(audit.batches(cloud, "bench-rest", ACCOUNT_STREAM)), within_s=_CATCH_UP_S)
-        before, began = machine.usage_of(agent.pid).cpu_s, time.monotonic()
+        before, began = _cpu_s(agent.pid), time.monotonic()
         time.sleep(seconds)
-        return (machine.usage_of(agent.pid).cpu_s - before) / (time.monotonic() - began) * 100
+        return (_cpu_s(agent.pid) - before) / (time.monotonic() - began) * 100
+
+
+def _cpu_s(pid: int) -> float:
+    return sum(threads.cpu_s for threads in machine.threads_of(pid).values())
 
 
 def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
@@ -208,7 +215,7 @@ def report(
             section.ratio(f"{name} / floor", agent_ms.p50 / floor_ms.p50, LIVE_TIMES)
     section.table("The agent", ["figure", "measured", "floor, same run"], rows)
     section.table(
-        "Its threads, `python` being those of rospy",
+        "Its threads; `ros1 node` with those of rospy",
         ["thread", *(f"us a sample, wake-ups a second at {run.rate_hz} Hz" for run in runs)],
         [
             [name, *("{:.1f}, {:.1f}".format(*run.threads.get(name, (0.0, 0.0))) for run in runs)]

@@ -31,6 +31,8 @@ HEADER, ARRIVAL = "header", "arrival"
 # A stamp further from the wall clock comes from a clock that is not set, or from a simulation.
 BELIEVABLE_US = 3600 * 1_000_000
 _SILENT_S = 5.0
+# Messages that wait together, at most: the one that the live lane sends waits for those before it.
+_TOGETHER = 16
 # A topic changes its definition when somebody rebuilds a package, not all the time.
 _MAX_KINDS = 32
 _MAX_PUBLISHERS = 32
@@ -100,7 +102,7 @@ class Intake:
         the first one after a pause costs as much as ten that follow it at once. Of a topic that falls silent,
         `look` takes them. Never raises."""
         self._inbox.append((header, data, self._clock.now_us()))
-        if self._clock.monotonic() >= self._due:
+        if len(self._inbox) >= _TOGETHER or self._clock.monotonic() >= self._due:
             self.take_received()
 
     def take_received(self) -> None:

@@ -57,6 +57,9 @@ def test_messages_wait_until_the_live_lane_wants_one() -> None:
         (i * 40_000, i) for i in range(4)
     ]
     assert desk.more == [False, True, True, False]
+    for _ in range(16):
+        desk.intake.receive(header, b"\x04")
+    assert len(desk.samples) == 20, "or until they are many"
 
 
 def test_the_last_message_of_a_silent_topic_waits_for_the_next_look() -> None:
