@@ -216,7 +216,7 @@ def test_a_content_whose_bytes_are_in_the_stamp_too_is_cut_out_of_its_array(tmp_
 def play(path, **settings):
     out = []
     source = BagConfig(path=path, topics=((TOPIC, "camera"),), **settings).build(ManualClock())
-    source.run(lambda *sample, more: out.append(sample), threading.Event())
+    source.run(lambda *sample: out.append(sample), threading.Event())
     # Without the stream of message types.
     return [sample for sample in out if sample[0] == "camera"]
 
