@@ -75,6 +75,34 @@ def test_every_newer_message_is_shown(page, car):
     assert page.evaluate("iort.outOfOrder") == 0
 
 
+# For each new text, how many frames after its message was heard it is drawn.
+FRAMES = """() => {
+  const text = () => document.querySelector("[data-value=voltage_input]").textContent;
+  let [frame, received, drawn, heard] = [0, iort.received, text(), undefined];
+  window.late = [];
+  const look = () => {
+    frame += 1;
+    if (iort.received !== received) [received, heard] = [iort.received, heard ?? frame];
+    if (text() !== drawn) {
+      late.push(frame - (heard ?? frame));
+      [drawn, heard] = [text(), undefined];
+    }
+    requestAnimationFrame(look);
+  };
+  requestAnimationFrame(look);
+}"""
+
+
+def test_a_message_after_a_pause_is_drawn_with_the_next_frame(page, car):
+    show(page, car.send())
+    page.evaluate(FRAMES)
+    for i in range(12):
+        show(page, car.send({**SAMPLE, "voltage_input": 10 + i / 10}))
+    late = page.evaluate("late")
+    assert len(late) == 12
+    assert max(late) <= 1
+
+
 def test_the_page_shows_any_field_of_any_stream(page, car):
     sample = {"pose.x": -1.25, "armed": True, "frame": "map", "nothing": None, "n": 1234567}
     show(page, car.send(sample, stream="odom"))

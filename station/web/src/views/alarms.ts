@@ -1,12 +1,12 @@
 // The alarms: what is wrong, since when, what to do, where to look; and who has seen it.
 
-import type { AlarmEntry, Config, Rejected, RejectedAnswer } from "../base/contract";
+import type { AlarmEntry, Rejected, RejectedAnswer } from "../base/contract";
 import { button, el, marked, Text, table, unserved } from "../base/dom";
 import { capital, when } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { writeTime } from "../base/range";
 import { route } from "../base/route";
-import type { Alarms, CarState, Raised } from "../live/alarms";
+import type { CarState, Raised } from "../live/alarms";
 import { ask, words } from "../server/answers";
 import { type Services, type View, viewNode } from "./view";
 
@@ -20,8 +20,6 @@ const STATES = { ALARM: "raised", INSUFFICIENT_DATA: "no data yet", OK: "quiet" 
 
 export class AlarmsView implements View {
   readonly node: HTMLElement;
-  private readonly config: Config;
-  private readonly alarms: Alarms;
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly name = el("input", {
     id: "acknowledge-as",
@@ -39,9 +37,8 @@ export class AlarmsView implements View {
   private quietDrawn: unknown;
   private failure = "";
 
-  constructor({ config, alarms }: Services) {
-    this.config = config;
-    this.alarms = alarms;
+  constructor(private readonly services: Services) {
+    const { config } = services;
     this.name.value = kept("name") ?? "";
     this.name.addEventListener("change", () => keep("name", this.name.value));
     const head = ["Alarm", "Meaning", "State", "What to do"];
@@ -72,15 +69,17 @@ export class AlarmsView implements View {
 
   /** Update what changes; an alarm that has not changed keeps its node, and with it the focus. */
   clock(now: number): void {
-    const { entries, error, askedAt, user } = this.alarms;
+    const { entries, error, askedAt, user } = this.services.alarms;
     this.name.placeholder = user;
     this.note.set(
-      this.failure || error || (entries ? `as of ${when(askedAt)}` : this.config.answers ? "Loading …" : ""),
+      this.failure ||
+        error ||
+        (entries ? `as of ${when(askedAt)}` : this.services.config.answers ? "Loading …" : ""),
     );
-    const raised = this.alarms.raised(now);
+    const raised = this.services.alarms.raised(now);
     if (raised.some(({ entry }) => entry?.evidence === "quarantine") && this.rejectedAt !== askedAt)
       void this.find(askedAt);
-    this.none.hidden = raised.length > 0 || (this.config.answers && entries === undefined);
+    this.none.hidden = raised.length > 0 || (this.services.config.answers && entries === undefined);
     const shown = raised.map((alarm) => this.card(alarm));
     if (shown.some((node, i) => this.list.children[i] !== node) || this.list.children.length !== shown.length)
       this.list.replaceChildren(...shown);
@@ -137,7 +136,7 @@ export class AlarmsView implements View {
   private async acknowledge(entry: AlarmEntry, button: HTMLButtonElement): Promise<void> {
     button.disabled = true;
     try {
-      await this.alarms.acknowledge(entry, this.name.value);
+      await this.services.alarms.acknowledge(entry, this.name.value);
       this.failure = "";
     } catch (error) {
       this.failure = words(error);

@@ -1,6 +1,6 @@
 // One car in full: gauges, the viewer's charts, the delay by hop, faults, and every field of every stream.
 
-import { type FieldTable, LIVE_MAX_RATE_HZ, LOG_STREAM } from "../base/contract";
+import { LIVE_MAX_RATE_HZ, LOG_STREAM } from "../base/contract";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import { AS_SENT, age, type Linear, linear, number } from "../base/format";
 import { type Query, type Route, type RouteTo, route, setAddress } from "../base/route";
@@ -14,11 +14,9 @@ import { StreamSection } from "../car/field_tiles";
 import { Settings } from "../car/settings";
 import { Gauge } from "../charts/gauge";
 import { Waterfall } from "../charts/waterfall";
-import type { DrivePanel } from "../drive/panel";
 import type { Looks } from "../link/viewing";
 import { asks } from "../link/viewing";
 import { MEDIAN_S, WINDOW_S } from "../live/bounds";
-import type { Fleet } from "../live/fleet";
 import { Past } from "../live/past";
 import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
@@ -33,9 +31,6 @@ const SCREENS = 25 * MEDIAN_S;
 
 export class CarView implements View<RouteTo<"car">> {
   readonly node: HTMLElement;
-  private readonly fleet: Fleet;
-  private readonly table: FieldTable;
-  private readonly drive: DrivePanel;
   private readonly links = el("p", { class: "tools" });
   private readonly heading = new Text("car-name", "h2");
   private readonly state = new Text("car-state");
@@ -61,10 +56,8 @@ export class CarView implements View<RouteTo<"car">> {
   /** The time at which a message was drawn, and its delay since arrival in milliseconds. */
   private screens = new Ring(2, SCREENS, MEDIAN_S);
 
-  constructor({ config, fleet, table, drive, changed }: Services) {
-    this.fleet = fleet;
-    this.table = table;
-    this.drive = drive;
+  constructor(private readonly services: Services) {
+    const { config, table, drive, changed } = services;
     this.asks = asks(config);
     this.past = new Past(config);
     this.waterfall = new Waterfall(config);
@@ -115,7 +108,7 @@ export class CarView implements View<RouteTo<"car">> {
   }
 
   waits(): boolean {
-    return !this.fleet.robots.has(this.name);
+    return !this.services.fleet.robots.has(this.name);
   }
 
   looks(): Looks {
@@ -123,7 +116,7 @@ export class CarView implements View<RouteTo<"car">> {
   }
 
   leave(): void {
-    this.fleet.watch(undefined);
+    this.services.fleet.watch(undefined);
     this.past.fill(undefined, 0);
     this.hear(undefined);
   }
@@ -150,14 +143,14 @@ export class CarView implements View<RouteTo<"car">> {
       this.heading.set(robot?.name ?? "");
       this.tools.of(robot);
       this.settings.heard(robot);
-      this.fleet.watch(robot);
+      this.services.fleet.watch(robot);
     }
     this.arrangeStreams();
   }
 
   /** Show the car if it is heard, with its streams and its neighbours. */
   arrange(): void {
-    this.hear(this.fleet.robots.get(this.name));
+    this.hear(this.services.fleet.robots.get(this.name));
     const [before, after] = this.neighbours();
     const tool = (text: string, to: Route, label = text): HTMLElement =>
       el("a", { class: "tool", href: route(to), "aria-label": label }, text);
@@ -178,7 +171,7 @@ export class CarView implements View<RouteTo<"car">> {
   }
 
   private neighbours(): [string | undefined, string | undefined] {
-    const names = [...this.fleet.robots.keys()].sort(byName);
+    const names = [...this.services.fleet.robots.keys()].sort(byName);
     const at = names.indexOf(this.name);
     if (names.length < 2 || at < 0) return [undefined, undefined];
     return [names.at(at - 1), names[(at + 1) % names.length]];
@@ -186,7 +179,8 @@ export class CarView implements View<RouteTo<"car">> {
 
   /** Make a section for each stream; called when a stream is new. */
   private arrangeStreams(): void {
-    const { robot, table } = this;
+    const { robot } = this;
+    const { table } = this.services;
     if (!robot) return;
     const vesc = robot.vesc(table);
     const gauged = new Set(vesc ? GAUGES.flatMap(({ fields }) => fields) : []);
@@ -215,12 +209,12 @@ export class CarView implements View<RouteTo<"car">> {
   }
 
   private write(robot: Robot, now: number): void {
-    const { table } = this;
+    const { table } = this.services;
     // What is drawn first was heard before the viewer came.
     if (this.drawn >= 0) this.screens.push([now, (now - robot.heardAt) * 1000]);
     this.drawn = robot.version;
     const vesc = robot.vesc(table);
-    const speed = this.fleet.speed(robot.name);
+    const speed = this.services.fleet.speed(robot.name);
     const newest = (field: string): number => numeric(vesc?.sample.get(field));
     GAUGES.forEach((each, i) => {
       const show = each.show(newest, robot, speed);
@@ -239,7 +233,7 @@ export class CarView implements View<RouteTo<"car">> {
   /** Update what changes with time. */
   clock(now: number, linked: boolean): void {
     const { robot } = this;
-    this.drive.driven(robot?.driver(now));
+    this.services.drive.driven(robot?.driver(now));
     if (!robot) return;
     this.past.fill(robot, this.tools.window_s);
     const charted = new Set(this.board.charts);
@@ -247,7 +241,7 @@ export class CarView implements View<RouteTo<"car">> {
     const screens = this.screens.column(1, now - MEDIAN_S);
     this.waterfall.refresh(robot, now, screens.length > 0 ? median(screens) : NaN);
     this.faults.refresh(robot);
-    const { messages, reason } = this.fleet.refused.get(robot.name) ?? { messages: 0, reason: "" };
+    const { messages, reason } = this.services.fleet.refused.get(robot.name) ?? { messages: 0, reason: "" };
     this.malformed.set(
       messages > 0
         ? `${messages} live ${messages === 1 ? "message" : "messages"} of this car could not be read; the last: ${reason}.`
@@ -271,7 +265,7 @@ export class CarView implements View<RouteTo<"car">> {
   /** The newest speed with its unit, and whether it is old; undefined for a car without one. */
   speed(now: number): Speed | undefined {
     const { robot } = this;
-    const vesc = robot?.vesc(this.table);
+    const vesc = robot?.vesc(this.services.table);
     if (!robot || !vesc?.sample.has("speed")) return undefined;
     const {
       value,
@@ -280,7 +274,7 @@ export class CarView implements View<RouteTo<"car">> {
     } = GAUGES.find(({ name }) => name === "speed_mps")!.show(
       (field) => numeric(vesc.sample.get(field)),
       robot,
-      this.fleet.speed(robot.name),
+      this.services.fleet.speed(robot.name),
     );
     return { text: `${number(value, digits)} ${unit}`, old: robot.freshness(now) !== "live" };
   }

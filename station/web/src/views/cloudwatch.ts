@@ -1,6 +1,6 @@
 // CloudWatch's deployed dashboards, drawn from the cloud's metrics.
 
-import type { Alarm, Config, Dashboard, DashboardsAnswer, Series, Widget } from "../base/contract";
+import type { Alarm, Dashboard, DashboardsAnswer, Series, Widget } from "../base/contract";
 import { choices, el, panel, Text, unserved } from "../base/dom";
 import { NOTHING, number, when } from "../base/format";
 import { route } from "../base/route";
@@ -23,7 +23,6 @@ const DASHES = [undefined, [6, 3], [2, 3]] as const;
 
 export class CloudWatchView implements View {
   readonly node: HTMLElement;
-  private readonly config: Config;
   private readonly choice = el("select", { id: "dashboard", name: "dashboard" });
   private readonly range = el("select", { id: "minutes", name: "minutes" }, ...choices(RANGES));
   private readonly note = new Text("history-note", "p", { role: "status" });
@@ -33,8 +32,8 @@ export class CloudWatchView implements View {
   private timer: number | undefined;
   private readonly loading = new Latest();
 
-  constructor({ config }: Services) {
-    this.config = config;
+  constructor(private readonly services: Services) {
+    const { config } = services;
     this.range.value = "60";
     for (const each of [this.choice, this.range]) each.addEventListener("change", () => void this.load());
     const form = el(
@@ -53,7 +52,7 @@ export class CloudWatchView implements View {
 
   show(): void {
     this.rest();
-    if (!this.config.answers) return;
+    if (!this.services.config.answers) return;
     void this.find();
     this.timer = window.setInterval(() => !document.hidden && void this.load(), REFRESH_S * 1000);
   }

@@ -1,6 +1,6 @@
 // Two to six runs, laps or robots on one axis: the time since each began, or the distance since then.
 
-import type { Config, FieldTable, StreamsAnswer } from "../base/contract";
+import type { StreamsAnswer } from "../base/contract";
 import { button, choices, el, Text, unserved } from "../base/dom";
 import { age, clockTime, number, when, zone } from "../base/format";
 import { type Range, same, writeTime } from "../base/range";
@@ -25,8 +25,6 @@ const UNSERVED =
 
 export class CompareView implements View<RouteTo<"compare">> {
   readonly node: HTMLElement;
-  private readonly config: Config;
-  private readonly table: FieldTable;
   private readonly stream = el("select", { id: "compare-stream" });
   private readonly axis = el("select", { id: "compare-axis" }, ...choices(AXES));
   private readonly out = button("Zoom out", () => this.back(), {
@@ -49,9 +47,8 @@ export class CompareView implements View<RouteTo<"compare">> {
   private readonly loading = new Latest();
   private settling: number | undefined;
 
-  constructor({ config, table, fleet }: Services) {
-    this.config = config;
-    this.table = table;
+  constructor(private readonly services: Services) {
+    const { config, table, fleet } = services;
     this.loader = new Parts(table, fleet);
     this.add = new AddPart(fleet, (part) => this.include(part));
     this.charts = new FieldCharts({
@@ -98,14 +95,14 @@ export class CompareView implements View<RouteTo<"compare">> {
   }
 
   show({ query = {} }: RouteTo<"compare">): void {
-    if (!this.config.answers) return;
+    if (!this.services.config.answers) return;
     this.parts = readParts(query.runs).slice(0, MOST_PARTS);
     this.wanted = query.fields?.split(",") ?? [];
     this.axis.value = query.x === "distance" ? "distance" : "time";
     const [from = NaN, to = NaN] = (query.zoom ?? "").split(",").map(Number);
     this.zoom = to > from ? [from, to] : undefined;
     this.zooms = [];
-    void this.enter(query.stream ?? this.table.stream);
+    void this.enter(query.stream ?? this.services.table.stream);
   }
 
   /** Find the streams of the first robot. */

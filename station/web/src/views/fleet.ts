@@ -1,12 +1,9 @@
 // Every car: one card each. Only the cards on the screen are updated, so that hundreds cost little more than a few.
 
-import type { FieldTable } from "../base/contract";
 import { byName, el, Text } from "../base/dom";
 import type { RouteTo } from "../base/route";
 import type { Stops } from "../drive/stops";
 import { GLANCE_HZ, type Looks } from "../link/viewing";
-import type { Fleet } from "../live/fleet";
-import type { Registry } from "../live/registry";
 import type { Robot } from "../live/robot";
 import { Card } from "../widgets/card";
 import { FleetTools } from "../widgets/fleet_tools";
@@ -22,9 +19,6 @@ const MOST_COMING = 50;
 
 export class FleetView implements View<RouteTo<"fleet">> {
   readonly node: HTMLElement;
-  private readonly fleet: Fleet;
-  private readonly table: FieldTable;
-  private readonly registry: Registry;
   private readonly stops: Stops;
   private readonly nav = el("nav", { class: "cars", id: "cars", "aria-label": "Cars" });
   private readonly tools: FleetTools;
@@ -57,10 +51,8 @@ export class FleetView implements View<RouteTo<"fleet">> {
   /** Updates the cards on the screen, as the last clock did. */
   private refresh: () => void = () => {};
 
-  constructor({ config, fleet, table, registry, stops }: Services) {
-    this.fleet = fleet;
-    this.table = table;
-    this.registry = registry;
+  constructor(private readonly services: Services) {
+    const { config, table, registry, stops } = services;
     this.stops = stops.stops;
     this.tools = new FleetTools(registry, table, () => (this.placedAt = -Infinity));
     this.offline = new OfflineCars(config);
@@ -78,7 +70,7 @@ export class FleetView implements View<RouteTo<"fleet">> {
   }
 
   waits(): boolean {
-    return this.fleet.robots.size === 0;
+    return this.services.fleet.robots.size === 0;
   }
 
   /** There are other cars, or they have moved. */
@@ -87,8 +79,8 @@ export class FleetView implements View<RouteTo<"fleet">> {
   }
 
   clock(now: number, linked: boolean): void {
-    if (this.registry.version !== this.known) {
-      this.known = this.registry.version;
+    if (this.services.registry.version !== this.known) {
+      this.known = this.services.registry.version;
       this.tools.offer();
       this.arrange();
     }
@@ -96,13 +88,13 @@ export class FleetView implements View<RouteTo<"fleet">> {
     if (now - this.placedAt >= PLACE_S && !held) this.place(now);
     this.refresh = () => {
       for (const name of this.seen) {
-        const robot = this.fleet.robots.get(name);
+        const robot = this.services.fleet.robots.get(name);
         if (robot)
           this.cards
             .get(name)
             ?.update(
               robot,
-              { fleet: this.fleet, table: this.table, stop: this.stops.word(name) },
+              { fleet: this.services.fleet, table: this.services.table, stop: this.stops.word(name) },
               now,
               linked,
             );
@@ -113,10 +105,10 @@ export class FleetView implements View<RouteTo<"fleet">> {
 
   /** The cars whose cards are on the screen, and those whose cards are still to come. */
   looks(): Looks {
-    const online = Object.entries(this.registry.robots ?? {}).flatMap(([name, presence]) =>
+    const online = Object.entries(this.services.registry.robots ?? {}).flatMap(([name, presence]) =>
       presence.online ? [name] : [],
     );
-    const coming = [...new Set([...this.fleet.robots.keys(), ...online])].filter(
+    const coming = [...new Set([...this.services.fleet.robots.keys(), ...online])].filter(
       (name) => !this.judged.has(name) && this.tools.finds(name),
     );
     return new Map([...this.seen, ...coming.slice(0, MOST_COMING)].map((name) => [name, GLANCE_HZ]));
@@ -142,9 +134,9 @@ export class FleetView implements View<RouteTo<"fleet">> {
   private place(now: number): void {
     this.placedAt = now;
     for (const [name, card] of this.cards) {
-      if (!this.fleet.robots.has(name)) this.remove(card);
+      if (!this.services.fleet.robots.has(name)) this.remove(card);
     }
-    const found = [...this.fleet.robots.values()].filter(({ name }) => this.tools.finds(name));
+    const found = [...this.services.fleet.robots.values()].filter(({ name }) => this.tools.finds(name));
     const folded = (robot: Robot): boolean => robot.overdue_s(now) > FOLD_S;
     const nodes: HTMLElement[] = [];
     for (const [heading, robots] of this.tools.arrange(
@@ -164,16 +156,17 @@ export class FleetView implements View<RouteTo<"fleet">> {
       next.remove();
       next = after;
     }
-    const registered = Object.entries(this.registry.robots ?? {}).filter(
-      ([name]) => !this.fleet.robots.has(name) && this.tools.finds(name),
+    const registered = Object.entries(this.services.registry.robots ?? {}).filter(
+      ([name]) => !this.services.fleet.robots.has(name) && this.tools.finds(name),
     );
     const away = [...registered, ...found.filter(folded).map((robot) => [robot.name, robot] as const)].sort(
       ([a], [b]) => byName(a, b),
     );
-    this.offline.show(away, this.fleet.robots.size === 0);
-    this.nothing.hidden = nodes.length > 0 || away.length > 0 || this.fleet.robots.size === 0;
+    this.offline.show(away, this.services.fleet.robots.size === 0);
+    this.nothing.hidden = nodes.length > 0 || away.length > 0 || this.services.fleet.robots.size === 0;
     // A page without cars has nothing to search.
-    this.tools.node.hidden = this.fleet.robots.size === 0 && registered.length === 0 && this.nothing.hidden;
+    this.tools.node.hidden =
+      this.services.fleet.robots.size === 0 && registered.length === 0 && this.nothing.hidden;
   }
 
   private heading(name: string, cars: number): HTMLElement {

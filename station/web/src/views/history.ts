@@ -1,6 +1,6 @@
 // A car's past: a range from the cloud's table, to zoom into, to play, to save, and to compare with the live values.
 
-import type { Config, FieldTable, HistoryAnswer, RunsAnswer, StreamsAnswer } from "../base/contract";
+import type { HistoryAnswer, RunsAnswer, StreamsAnswer } from "../base/contract";
 import { el, Text, unserved } from "../base/dom";
 import { age, number, when } from "../base/format";
 import { inUs, LEAST_S, type Range, readRange, readTime, rounded, same, writeTime } from "../base/range";
@@ -26,8 +26,6 @@ const UNSERVED =
 
 export class HistoryView implements View<RouteTo<"history">> {
   readonly node: HTMLElement;
-  private readonly config: Config;
-  private readonly table: FieldTable;
   private readonly name = new Text("car-name", "h2");
   private readonly live = el("a", { class: "tool" }, "Live");
   private readonly insights = el("a", { class: "tool" }, "Insights");
@@ -43,9 +41,8 @@ export class HistoryView implements View<RouteTo<"history">> {
   private readonly loading = new Latest();
   private settling: number | undefined;
 
-  constructor({ config, table, fleet }: Services) {
-    this.config = config;
-    this.table = table;
+  constructor(private readonly services: Services) {
+    const { config, table, fleet } = services;
     this.form = new RangeForm({
       range: (range) => this.open(range),
       wrong: (text) => this.note.set(text),
@@ -115,7 +112,7 @@ export class HistoryView implements View<RouteTo<"history">> {
     this.note.set("");
     this.runs.set(robot, undefined);
     this.form.node.inert = true;
-    if (this.config.answers) void this.enter(robot, query);
+    if (this.services.config.answers) void this.enter(robot, query);
   }
 
   clock(): void {
@@ -129,7 +126,7 @@ export class HistoryView implements View<RouteTo<"history">> {
     await this.loading.run(
       async (signal) => {
         const { streams } = await ask<StreamsAnswer>("streams", { robot }, signal);
-        const stream = [query.stream, this.table.stream, streams[0]].find(
+        const stream = [query.stream, this.services.table.stream, streams[0]].find(
           (name) => name !== undefined && streams.includes(name),
         );
         this.form.node.hidden = stream === undefined;

@@ -1,6 +1,6 @@
 // What the analysis says of a car's drives, or of the fleet's.
 
-import type { Config, Extent, InsightsAnswer, RunsAnswer } from "../base/contract";
+import type { Extent, InsightsAnswer, RunsAnswer } from "../base/contract";
 import { el, Text, unserved } from "../base/dom";
 import { when } from "../base/format";
 import { type Range, readTime, writeTime } from "../base/range";
@@ -20,7 +20,6 @@ const UNSERVED =
 
 export class InsightsView implements View<RouteTo<"insights">> {
   readonly node: HTMLElement;
-  private readonly config: Config;
   private readonly name = new Text("car-name", "h2");
   private readonly tools = el("p", { class: "tools" });
   private readonly note = new Text("history-note", "p", { role: "status" });
@@ -38,8 +37,8 @@ export class InsightsView implements View<RouteTo<"insights">> {
   private answer: InsightsAnswer | undefined;
   private drive: Range | undefined;
 
-  constructor({ config }: Services) {
-    this.config = config;
+  constructor(private readonly services: Services) {
+    const { config } = services;
     this.notes = new NotesPanel(config);
     const status = el(
       "div",
@@ -71,7 +70,7 @@ export class InsightsView implements View<RouteTo<"insights">> {
             el("a", { class: "tool", href: route({ view: "insights" }) }, "Fleet"),
           ]),
     );
-    if (!this.config.answers) return;
+    if (!this.services.config.answers) return;
     this.analyse.of(robot);
     void this.notes.show(robot);
     if (robot !== this.robot || !this.answer) void this.load(robot, query);
