@@ -11,6 +11,8 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import channel as pubnub_channel
 from iort_contract.messages.live import LiveSample, live_update
 
+# Of a page that hears nobody.
+SETTINGS = {"namespace": "iort", "subscribe_key": "sub-c-1", "origin": "127.0.0.1:9", "tls": False}
 PUBLISH_KEY, SUBSCRIBE_KEY = "pub-local", "sub-local"
 GAIN = F1TENTH.speed_to_erpm_gain
 SAMPLE = {

@@ -25,13 +25,8 @@ from iort_station.page.places import (
     client_of,
 )
 from iort_station.page.server import PageServer
+from tests.web.cars import SETTINGS
 
-SETTINGS = {
-    "namespace": "iort",
-    "subscribe_key": "sub-c-1",
-    "origin": "127.0.0.1:9",
-    "tls": False,
-}
 HERE = "127.0.0.1"
 READ = ("history", "runs", "rejected", "insights")
 
@@ -43,6 +38,11 @@ class Held:
         self.begun, self.go_on = threading.Semaphore(0), threading.Event()
         self.ended = []
         self.sent = []
+
+    def wait(self, count):
+        """Wait until so many more have begun."""
+        for _ in range(count):
+            assert self.begun.acquire(timeout=60)
 
     def answer(self, name):
         def hold(_asked):
@@ -143,8 +143,7 @@ def test_a_stop_is_handled_while_everything_else_is_held(page, held):
                 client.begin("/acknowledge.json", {"alarm": "x"})
                 client.begin("/history.csv")
         # Every place is taken: of answers, of actions, of downloads; and sends wait without one.
-        for _ in range(MOST_ANSWERS + MOST_ANSWERS + MOST_DOWNLOADS):
-            assert held.begun.acquire(timeout=60)
+        held.wait(MOST_ANSWERS + MOST_ANSWERS + MOST_DOWNLOADS)
         client = Client(page, stack)
         for robot in ("car1", "car2"):
             assert client.ask("/stop.json", {"robot": robot}) == (200, {"robot": robot})
@@ -165,18 +164,16 @@ def test_one_client_takes_neither_all_places_nor_those_of_other_kinds(page, held
         one, other = Client(page, stack), Client(page, stack, "127.0.0.2")
         for _ in range(ANSWERS_OF_KIND + 5):
             one.begin("/runs.json")
-        for _ in range(ANSWERS_OF_KIND):
-            assert held.begun.acquire(timeout=60)
+        held.wait(ANSWERS_OF_KIND)
         one.begin("/rejected.json")
-        assert held.begun.acquire(timeout=60)
+        held.wait(1)
         for _ in range(ANSWERS_OF_CLIENT):
             one.begin("/insights.json")
-        for _ in range(ANSWERS_OF_CLIENT - ANSWERS_OF_KIND - 1):
-            assert held.begun.acquire(timeout=60)
+        held.wait(ANSWERS_OF_CLIENT - ANSWERS_OF_KIND - 1)
         assert one.ask("/config.json")[0] == 200
         assert threads() == ANSWERS_OF_CLIENT
         other.begin("/history.json")
-        assert held.begun.acquire(timeout=60)
+        held.wait(1)
         assert held.ended == []
 
 
@@ -198,8 +195,7 @@ def test_a_send_that_waits_holds_no_place(page, held):
     with ExitStack() as stack:
         client = Client(page, stack)
         waiting = [client.begin("/send.json", {"robot": "away"}) for _ in range(PENDING_OF_CLIENT)]
-        for _ in range(PENDING_OF_CLIENT):
-            assert held.begun.acquire(timeout=60)
+        held.wait(PENDING_OF_CLIENT)
         # One that cannot wait is not sent either.
         assert client.ask("/send.json", {"robot": "late"})[0] == 429
         other = Client(page, stack, "127.0.0.2")
@@ -216,8 +212,7 @@ def test_places_are_free_again_although_their_viewers_left(page, held):
         for _ in range(ANSWERS_OF_KIND):
             client.begin("/runs.json")
         client.begin("/history.csv")
-        for _ in range(ANSWERS_OF_KIND + 1):
-            assert held.begun.acquire(timeout=60)
+        held.wait(ANSWERS_OF_KIND + 1)
     with ExitStack() as stack:
         client = Client(page, stack)
         waiting = [client.begin("/runs.json"), client.begin("/history.csv")]

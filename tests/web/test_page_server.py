@@ -22,13 +22,7 @@ from iort_station.page.background import BackgroundServer
 from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import PageServer, on_loopback
 from testkit.ports import free_port
-
-SETTINGS = {
-    "namespace": "iort",
-    "subscribe_key": "sub-c-1",
-    "origin": "127.0.0.1:9",
-    "tls": False,
-}
+from tests.web.cars import SETTINGS
 
 
 @pytest.fixture(scope="module")
