@@ -187,9 +187,6 @@ def configure(bundle: Bundle, settings: Mapping[str, Any]) -> None:
     write_private(bundle.config, yaml.safe_dump({**config, **settings}, sort_keys=False))
 
 
-if TYPE_CHECKING:
-    from types_boto3_iot import IoTClient
-
 # The claim's file in its folder.
 CLAIM_FILE = "claim.yaml"
 # AWS' own claims can connect for five minutes; the margin is for one that connects at the end.
