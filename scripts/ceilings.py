@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 from aws_cdk import App
 
@@ -18,12 +17,10 @@ from iort_station.cost.prices import MONTH_DAYS, PRICES
 from stacks.settings import A_ROBOTS_MOST, CONNECTION_MESSAGES_S, Settings
 
 _DAY_S = 86_400
-_QUIET_MAILS = _DAY_S // QUIET_S
 Resource = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Ceiling:
+class Ceiling(NamedTuple):
     """A limit: what it bounds, its figure, the template's property that holds it, and dollars a day at it."""
 
     what: str
@@ -62,86 +59,67 @@ class Templates:
         return {one["Type"] for one in self.resources.values()}
 
 
+_TABLES = {
+    "Batches": "telemetry stored, all robots together",
+    "Summary": "seconds stored, all robots together",
+    "Robots": "robots' rows",
+    "Archive": "the archive's notes and marks",
+    "Quarantine": "refused messages stored",
+    "Findings": "findings stored",
+}
+# A function, the mapping that calls it, and for what.
+_READERS = (
+    ("Quarantine", "Rejections", "refused messages read"),
+    ("Later", "PutOffs", "batches over a robot's share"),
+    ("Archive", "Tasks", "hours archived"),
+)
+
+
 def robot(templates: Templates) -> Iterator[Ceiling]:
     """The limits of a robot with a valid certificate that sends what it can."""
-    for table, what in {
-        "Batches": "telemetry stored, all robots together",
-        "Summary": "seconds stored, all robots together",
-        "Robots": "robots' rows",
-        "Archive": "the archive's notes and marks",
-        "Quarantine": "refused messages stored",
-        "Findings": "findings stored",
-    }.items():
+    for table, what in _TABLES.items():
         most = templates.one("DynamoDB::Table", table)["OnDemandThroughput"]["MaxWriteRequestUnits"]
-        limit = f"{most:,} write units a second"
-        yield Ceiling(what, limit, f"`{table}`: `MaxWriteRequestUnits`", _a_second("write", most))
-    for function, mapping, what in (
-        ("Quarantine", "Rejections", "refused messages read"),
-        ("Later", "PutOffs", "batches over a robot's share"),
-        ("Archive", "Tasks", "hours archived"),
-    ):
+        held_by = f"`{table}`: `MaxWriteRequestUnits`"
+        yield Ceiling(what, f"{most:,} write units a second", held_by, _a_day("write", most))
+    for function, mapping, what in _READERS:
         at_once = templates.one("Lambda::EventSourceMapping", mapping)["ScalingConfig"]["MaximumConcurrency"]
         memory_mb = templates.one("Lambda::Function", function)["MemorySize"]
-        yield Ceiling(
-            what,
-            f"{at_once} calls at once of {memory_mb} MB",
-            f"`{mapping}`: `MaximumConcurrency`",
-            _a_second("compute_arm", at_once * memory_mb / 1024),
-        )
+        limit = f"{at_once} calls at once of {memory_mb} MB"
+        usd = _a_day("compute_arm", at_once * memory_mb / 1024)
+        yield Ceiling(what, limit, f"`{mapping}`: `MaximumConcurrency`", usd)
     files = templates.one("S3::Bucket", "Files")["LifecycleConfiguration"]["Rules"]
     (days,) = [rule["ExpirationInDays"] for rule in files if rule["Id"] == "old"]
     gb = int(_variable(templates, "Upload", "UPLOAD_BYTES_A_DAY")) / 1e9
-    yield Ceiling(
-        "files stored, by a robot",
-        f"{gb:g} GB a day, each for {days} days",
-        "`Upload`: `UPLOAD_BYTES_A_DAY`; `Files`: `ExpirationInDays`",
-        gb * days * PRICES["s3_standard"].usd / MONTH_DAYS,
-    )
-    asked_s = sum(one.per_hour * one.timeout_s * one.memory_mb / 1024 for one in QUESTIONS.values())
-    slow = templates.one("Lambda::Function", "Answer")
-    assert slow["Timeout"] >= max(one.timeout_s for one in QUESTIONS.values())
-    number = sum(one.per_hour for one in QUESTIONS.values())
-    yield Ceiling(
-        "questions, by a robot",
-        f"{number} an hour, of at most {slow['Timeout']} s",
-        "the catalogue's quotas; `Answer`: `Timeout`",
-        asked_s * 24 * PRICES["compute_arm"].usd,
-    )
-    yield Ceiling(
-        "mails, by a robot and cause", f"{_QUIET_MAILS} a day", "`Alert`: one in 15 minutes a cause", None
-    )
-    record_gb = int(_variable(templates, "Summarize", "RECORD_BYTES_A_DAY")) / 1e9
-    yield Ceiling(
-        "telemetry of a robot, before an alarm names it",
-        f"{record_gb:g} GB a day",
-        "`Summarize`: `RECORD_BYTES_A_DAY`; alarm `RobotsOverVolume`",
-        record_gb * 1e9 / 1024 * PRICES["write"].usd / PRICES["write"].per,
-    )
+    held_by = "`Upload`: `UPLOAD_BYTES_A_DAY`; `Files`: `ExpirationInDays`"
+    usd = gb * days * PRICES["s3_standard"].usd / MONTH_DAYS
+    yield Ceiling("files stored, by a robot", f"{gb:g} GB a day, each for {days} days", held_by, usd)
+    timeout_s, questions = templates.one("Lambda::Function", "Answer")["Timeout"], QUESTIONS.values()
+    assert timeout_s >= max(question.timeout_s for question in questions)
+    limit = f"{sum(question.per_hour for question in questions)} an hour, of at most {timeout_s} s"
+    gb_s = sum(question.per_hour * question.timeout_s * question.memory_mb / 1024 for question in questions)
+    usd = gb_s * 24 * PRICES["compute_arm"].usd
+    yield Ceiling("questions, by a robot", limit, "the catalogue's quotas; `Answer`: `Timeout`", usd)
+    held_by = "`Alert`: one in 15 minutes a cause"
+    yield Ceiling("mails, by a robot and cause", f"{_DAY_S // QUIET_S} a day", held_by, None)
+    gb = int(_variable(templates, "Summarize", "RECORD_BYTES_A_DAY")) / 1e9
+    held_by = "`Summarize`: `RECORD_BYTES_A_DAY`; alarm `RobotsOverVolume`"
+    usd = gb * 1e9 / 1024 * PRICES["write"].each
+    yield Ceiling("telemetry of a robot, before an alarm names it", f"{gb:g} GB a day", held_by, usd)
 
 
 def at_the_broker() -> Iterator[Ceiling]:
     """What AWS' own quota of a connection bounds; no template can lower it."""
-    yield Ceiling(
-        "telemetry of one robot, stored",
-        f"{A_ROBOTS_MOST} write units a second: 512 KB, 100 messages",
-        "AWS: throughput and publishes of a connection",
-        _a_second("write", A_ROBOTS_MOST),
-    )
+    held_by = "AWS: throughput and publishes of a connection"
+    limit = f"{A_ROBOTS_MOST} write units a second: 512 KB, 100 messages"
+    yield Ceiling("telemetry of one robot, stored", limit, held_by, _a_day("write", A_ROBOTS_MOST))
     metered = A_ROBOTS_MOST / 5
-    per_message = sum(PRICES[name].usd / PRICES[name].per for name in ("message", "rule", "action"))
-    yield Ceiling(
-        "messages of one robot, each with a rule and its action",
-        f"{metered:.0f} a second, of 5 KB each",
-        "AWS: the same",
-        metered * _DAY_S * per_message,
-    )
-
-    yield Ceiling(
-        "live messages of one robot through PubNub",
-        f"{CONNECTION_MESSAGES_S} a second",
-        "AWS: publishes of a connection; none of ours",
-        CONNECTION_MESSAGES_S * _DAY_S * PRICES["pubnub_publish"].usd,
-    )
+    usd = sum(_a_day(price, metered) for price in ("message", "rule", "action"))
+    what = "messages of one robot, each with a rule and its action"
+    yield Ceiling(what, f"{metered:.0f} a second, of 5 KB each", "AWS: the same", usd)
+    held_by = "AWS: publishes of a connection; none of ours"
+    usd = _a_day("pubnub_publish", CONNECTION_MESSAGES_S)
+    limit = f"{CONNECTION_MESSAGES_S} a second"
+    yield Ceiling("live messages of one robot through PubNub", limit, held_by, usd)
 
 
 def stranger(templates: Templates) -> Iterator[Ceiling]:
@@ -177,8 +155,8 @@ def rows() -> Iterator[tuple[str, str, str, str, str]]:
             yield who, one.what, one.limit, one.held_by, usd
 
 
-def _a_second(price: str, units: float) -> float:
-    return units * _DAY_S * PRICES[price].usd / PRICES[price].per
+def _a_day(price: str, units_a_second: float) -> float:
+    return units_a_second * _DAY_S * PRICES[price].each
 
 
 def _variable(templates: Templates, function: str, name: str) -> str:
