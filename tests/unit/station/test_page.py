@@ -57,21 +57,28 @@ def test_many_samples_are_returned_as_mean_least_and_most():
     assert speed["mean"] == pytest.approx((np.array(speed["least"]) + np.array(speed["most"])) / 2)
 
 
-def test_a_row_has_the_last_text_or_bool_and_null_stays_null():
-    times = [START + 20_000 * i for i in range(4)]
-    columns = {"frame": ["a", "b", "c", "d"], "on": [True, False, True, True], "x": [None, None, 3.5, None]}
+def two_rows(columns):
+    """The fields of two rows of these samples."""
+    times = [START + 20_000 * i for i in range(len(next(iter(columns.values()))))]
     found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
-    assert found["fields"]["frame"]["mean"] == ["b", "d"]
-    assert found["fields"]["on"]["mean"] == [False, True]
-    assert found["fields"]["x"] == {"mean": [None, 3.5], "least": [None, 3.5], "most": [None, 3.5]}
     json.dumps(found, allow_nan=False)
+    return found["fields"]
 
 
-def test_a_thumbnail_beside_nulls_is_not_lost():
-    times = [START + 20_000 * i for i in range(6)]
-    columns = {"n": list(range(6)), "data.thumbnail": [None, "first", None, None, None, None]}
-    found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
-    assert found["fields"]["data.thumbnail"]["mean"] == ["first", None]
+@pytest.mark.parametrize(
+    ("column", "rows"),
+    [
+        (["a", "b", "c", "d"], {"mean": ["b", "d"]}),
+        ([True, False, True, True], {"mean": [False, True]}),
+        ([None, None, 3.5, None], {"mean": [None, 3.5], "least": [None, 3.5], "most": [None, 3.5]}),
+        # A thumbnail beside nulls is not lost.
+        ([None, "first", None, None, None, None], {"mean": ["first", None]}),
+        # Their sum is beyond the largest number.
+        ([1.7e308] * 4, {"mean": [None] * 2, "least": [1.7e308] * 2, "most": [1.7e308] * 2}),
+    ],
+)
+def test_a_row_of_several_samples_has_their_extremes_or_the_last_that_is_not_null(column, rows):
+    assert two_rows({"x": column, "n": list(range(len(column)))})["x"] == rows
 
 
 def test_the_fields_of_an_attachment_are_of_one_sample():
@@ -83,18 +90,9 @@ def test_the_fields_of_an_attachment_are_of_one_sample():
         "thumbnail": ["small a", None, None, None],
     }
     columns = {f"data.{part}": values for part, values in parts.items()}
-    times = [START + 20_000 * i for i in range(4)]
-    found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
-    assert found["fields"] == {
+    assert two_rows(columns) == {
         f"data.{part}": {"mean": [values[1], values[3]]} for part, values in parts.items()
     }
-
-
-def test_a_number_without_json_form_is_null():
-    times = [START + 20_000 * i for i in range(4)]
-    found = history(cloud_of(Batch("0badcafe", 0, times, {"x": [1.7e308] * 4})), {**ASKED, "rows": "2"})
-    # Their sum is beyond the largest number.
-    assert found["fields"]["x"] == {"mean": [None] * 2, "least": [1.7e308] * 2, "most": [1.7e308] * 2}
 
 
 def test_an_empty_range_gives_an_empty_result():
