@@ -14,12 +14,11 @@ from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.samples.batches import in_order
 from iort_analysis.samples.blocks import join, values
 from iort_contract.archive import ARCHIVE, HOUR, HOUR_REST_MS, TASK, Hour, Pending
-from iort_contract.catalog.environments import ArchiveEnvironment
 from iort_contract.dynamodb import starting_between
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import BATCH, EXPIRES_S, TOPIC
 from iort_contract.topics import parse_topic
-from testkit.dynamodb import FILES, ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of
+from testkit.dynamodb import FILES, TELEMETRY, TOPIC_OF_CAR, item_of
 from tests.unit.contract.contract_values import BOOT
 
 DAY_S = 86_400
@@ -99,7 +98,6 @@ def kill(**_):
 def cloud_of_archive(dynamodb, s3, monkeypatch):
     """An empty deployment."""
     url = boto3.client("sqs").create_queue(QueueName="tasks")["QueueUrl"]
-    given = ArchiveEnvironment("iort", TELEMETRY, "archive", ROBOTS, FILES, url, RETENTION_S)
-    for name, value in given.variables().items():
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("ARCHIVE_QUEUE", url)
+    monkeypatch.setenv("RETENTION_S", str(RETENTION_S))
     return Cloud(dynamodb, s3)

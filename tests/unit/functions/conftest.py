@@ -7,6 +7,17 @@ from types import SimpleNamespace
 import pytest
 
 from functions.quarantine import entries
+from testkit.dynamodb import ARCHIVE, FILES, FINDINGS, QUARANTINE, ROBOTS, SUMMARY, TELEMETRY
+
+
+@pytest.fixture(autouse=True)
+def variables_of_functions(monkeypatch):
+    """What the environment of every function says; a test adds what only its own has."""
+    tables = (TELEMETRY, SUMMARY, ROBOTS, ARCHIVE, FINDINGS, QUARANTINE)
+    for name, value in {f"{table}_table".upper(): table for table in tables}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("FILES_BUCKET", FILES)
+    monkeypatch.setenv("REJECTED_QUEUE", "https://sqs.eu-west-1.amazonaws.com/0/none")
 
 
 @pytest.fixture

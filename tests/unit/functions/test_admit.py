@@ -40,10 +40,8 @@ def request(robot="car", serial="s1", certificate="new", claim="claim"):
 
 
 @pytest.fixture
-def robots(dynamodb, monkeypatch):
+def robots(dynamodb):
     """moto's robots table: `put` a row, `ask` the handler, `row` again."""
-    monkeypatch.setenv("ROBOTS_TABLE", ROBOTS)
-    monkeypatch.setenv("NAMESPACE", "iort")
 
     class Robots:
         @staticmethod

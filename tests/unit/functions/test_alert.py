@@ -160,10 +160,8 @@ def disconnected(version=0, at_ms=T0, reason="CONNECTION_LOST", client="car"):
 
 
 @pytest.fixture
-def table(dynamodb, monkeypatch):
+def table(dynamodb):
     """moto's robots table with one robot; a call with events returns the resulting row."""
-    monkeypatch.setenv("ROBOTS_TABLE", ROBOTS)
-    monkeypatch.setenv("NAMESPACE", "iort")
 
     def row_after(*events):
         dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})

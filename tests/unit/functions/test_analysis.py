@@ -47,14 +47,6 @@ from tests.unit.analysis.simulated import HZ, START_US, changed, streams
 
 S = 1_000_000
 CAR, RUN = "car", "00c0ffee"
-VARIABLES = {
-    "TELEMETRY_TABLE": TELEMETRY,
-    "ARCHIVE_TABLE": ARCHIVE,
-    "ROBOTS_TABLE": ROBOTS,
-    "FINDINGS_TABLE": FINDINGS,
-    "FILES_BUCKET": FILES,
-    "PAGE_URL": PAGE_URL,
-}
 JOB = "night"
 
 
@@ -126,8 +118,8 @@ class Deployed:
 @pytest.fixture
 def cloud(dynamodb: Any, s3: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Deployed]:
     topic = boto3.client("sns").create_topic(Name="alarms")["TopicArn"]
-    for name, value in {**VARIABLES, "ALARM_TOPIC": topic}.items():
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("ALARM_TOPIC", topic)
+    monkeypatch.setenv("PAGE_URL", PAGE_URL)
     return Deployed(dynamodb, s3, topic)
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import math
 
 import boto3
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from functions import live
 from functions.live import REFUSALS, Lane, RefusedError, age_ms
@@ -213,28 +210,6 @@ MALFORMED = [
     7,
     None,
 ]
-
-
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=10),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=8,
-)
-
-
-@given(
-    st.dictionaries(st.sampled_from(sorted(event())), json_values),
-    st.dictionaries(st.sampled_from(sorted(json.loads(MESSAGE))), json_values),
-    json_values,
-)
-def test_any_event_is_shown_or_refused(changes, said, anything):
-    channels = Channels()
-    for one in ({**event(), **changes}, saying(**said), anything):
-        with contextlib.suppress(RefusedError):
-            show(one, channels)
-    for channel, message in channels.sent:
-        assert channel.startswith("iort.")
-        json.dumps(message, allow_nan=False)
 
 
 def test_an_error_of_pubnub_is_counted_and_not_raised(counted, caplog):

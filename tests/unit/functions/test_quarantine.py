@@ -98,17 +98,6 @@ def records(info):
     return [{"dynamodb": {"SequenceNumber": str(n), "NewImage": image(n)}} for n in (2, 3)]
 
 
-# The variables of the functions that refuse events.
-DEPLOYED = {
-    "ROBOTS_TABLE": "robots",
-    "FINDINGS_TABLE": "findings",
-    "FILES_BUCKET": "files",
-    "UPLOAD_BYTES_A_DAY": "1",
-    "PUBNUB_PARAMETER": "/iort/pubnub",
-    "LIVE_FIELDS": "{}",
-}
-
-
 def none(_info):
     return []
 
@@ -208,7 +197,11 @@ REFUSING = {echo: (PING, LAMBDA), upload: (PING, FILE), answer: (ASK, "calibrati
 def test_what_a_function_refuses_is_kept_and_fails_only_without_the_queue(
     function, invoke, rejected, monkeypatch
 ):
-    for name, value in DEPLOYED.items():
+    for name, value in {
+        "UPLOAD_BYTES_A_DAY": "1",
+        "PUBNUB_PARAMETER": "/iort/pubnub",
+        "LIVE_FIELDS": "{}",
+    }.items():
         monkeypatch.setenv(name, value)
     lane, name = REFUSING[function]
     event = rule_event(b"\xff", build_topic(lane, "car", name), NOW_MS)

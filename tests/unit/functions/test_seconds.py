@@ -16,7 +16,7 @@ from functions.shared.tables import attribute
 from iort_contract import tables
 from iort_contract.codec import flat_second
 from iort_contract.dynamodb import plain
-from iort_contract.messages.batch import Batch, decode_item, split_batch
+from iort_contract.messages.batch import Batch, decode_item
 from iort_contract.statistics import missing_before, summarize_second
 from iort_contract.tables import EXPIRES_S, OMITTED, STATS, TOPIC
 from testkit.dynamodb import ROBOTS, TOPIC_OF_CAR, FakeDynamoDB
@@ -110,13 +110,6 @@ def test_a_second_counts_its_first_batches_and_refuses_further_ones(stream, caps
     assert f'"BatchesSummarized":{SECOND_BATCHES}' in said
 
 
-def test_a_refused_batch_stays_in_the_stream_if_the_queue_does_not_take_it(stream):
-    records = stream.store(*packed(SECOND_BATCHES + 1))
-    number = records[-1]["dynamodb"]["SequenceNumber"]
-    stream.jammed = {number}
-    assert stream.summarize(records) == {"batchItemFailures": [{"itemIdentifier": number}]}
-
-
 def test_the_allowed_number_of_batches_is_summarised(stream):
     stream.deliver(*packed(SECOND_BATCHES))
     assert stream.column("batches") == {0: SECOND_BATCHES}
@@ -167,14 +160,6 @@ def test_large_batches_fill_a_second_by_their_size(stream):
     stream.deliver(*batches)
     assert stream.column("batches")[0] < len(batches)
     assert stream.column("batches")[0] + len(stream.refused) == len(batches)
-
-
-def test_other_seconds_and_streams_are_not_affected(stream):
-    other = "dt/iort/bus/vesc"
-    records = stream.store(*packed(MANY)) + stream.store(*packed(2, second=5), topic=other)
-    stream.summarize(records)
-    assert [item["batches"] for item in stream.summary(other).values()] == [2]
-    assert len(stream.refused) == MANY - SECOND_BATCHES
 
 
 def test_a_reader_reports_full_seconds(stream):
@@ -355,21 +340,3 @@ def assert_summary(summary, drive):
                 assert float(item[f"{name}_mean"]) == pytest.approx(sum(column) / len(column), rel=1e-8)
             else:
                 assert f"{name}_last" not in item
-
-
-@examples(60)
-@given(drives())
-def test_a_batch_sent_in_two_halves_gives_the_same_samples(drive):
-    whole, halved = Stream(), Stream()
-    whole.deliver(*drive)
-    # Batches may overlap here; two that start at the same time would be one item.
-    taken = {b.t_us for b in drive}
-    for b in drive:
-        halves = split_batch(b) if len(b.times_us) > 1 and split_batch(b)[1].t_us not in taken else (b,)
-        taken.add(halves[-1].t_us)
-        halved.deliver(*halves)
-    for second, item in whole.summary().items():
-        other = halved.summary()[second]
-        assert {k: v for k, v in other.items() if k.endswith(("_min", "_max")) or k == "n"} == {
-            k: v for k, v in item.items() if k.endswith(("_min", "_max")) or k == "n"
-        }

@@ -15,7 +15,6 @@ from functions.shared.quotas import RateLimiter
 from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
 from functions.shared.summary import Bounds, measure, process, together
 from functions.summarize import EVERY_S, PARTS, Volume, size_of
-from iort_contract.catalog.metrics import metrics_of
 from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
 from iort_contract.catalog.vesc import TEMPERATURES, VESC_STREAM, hottest_degc
 from iort_contract.dynamodb import TableError
@@ -420,11 +419,6 @@ def test_round_trips_and_the_agents_own_figures_are_measured():
     assert measure(RTT_STREAM, [rtt]) == figures
     agent = measured_batch({"backlog_batches": [0, 7], "thread_errors": [0, 2]})
     assert measure(AGENT_STREAM, [agent]) == {"AgentReports": 2, "BacklogBatches": [7.0], "ThreadErrors": 2}
-
-
-@pytest.mark.parametrize("stream", ["vesc", RTT_STREAM, AGENT_STREAM])
-def test_the_metric_names_are_the_contracts(stream):
-    assert measure(stream, [measured_batch({"x": [1.0]})]).keys() <= set(metrics_of("health"))
 
 
 def test_several_robots_share_one_log_line_without_loss_of_values():
