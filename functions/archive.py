@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 from functions.shared.archive import Archive, archive
 from functions.shared.metrics import emit
@@ -32,8 +32,10 @@ from iort_contract.archive import (
     SAFE_UNTIL_S,
     SWEEP,
     TASK,
+    ArchivedHour,
     Hour,
     Pending,
+    archived_hour,
     hour_of,
     hours_between,
     parse_hour,
@@ -177,7 +179,7 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
             Pending(topic, hour)
             for hour, row in archived.items()
             if soon_s - _COUNTED_S < row.first_expires_s <= soon_s
-            and _count(archive, topic, parse_hour(hour)) > row.items
+            and _count(archive, topic, parse_hour(hour)) > row.batches + row.refused
         ]
     for pending in found:
         if not every:
@@ -187,22 +189,10 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
     return {"tasks": len(tasks)}
 
 
-class _Archived(NamedTuple):
-    """What a row of the manifest says: the number of items, and when the first of them expires."""
-
-    items: int
-    first_expires_s: int
-
-
-def _archived(archive: Archive, topic: str, first: Hour) -> dict[str, _Archived]:
+def _archived(archive: Archive, topic: str, first: Hour) -> dict[str, ArchivedHour]:
     """The archived hours since the first one."""
-    attributes = (HOUR, "batches", "refused", "first_expires_s")
-    pages = archive.manifest.pages(topic, hours_between(first, None), attributes=attributes)
-    rows = (plain(item) for page in pages for item in page.items)
-    return {
-        row[HOUR]: _Archived(int(row["batches"] + row["refused"]), int(row["first_expires_s"]))
-        for row in rows
-    }
+    pages = archive.manifest.pages(topic, hours_between(first, None))
+    return {row.hour: row for page in pages for item in page.items for row in (archived_hour(item),)}
 
 
 def _count(archive: Archive, topic: str, hour: Hour) -> int:

@@ -7,6 +7,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Iterator, Mapping
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from botocore.exceptions import ClientError
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
 class Part(NamedTuple):
     """A part in S3, which has computed the SHA-256 and compared it with the signed one."""
 
-    size: int
     etag: str
     sha256: str
 
@@ -83,14 +83,12 @@ class Bucket:
 
     def parts(self, key: str, upload_id: str) -> dict[int, Part]:
         """The uploaded parts by number."""
-        return dict(self._listed(key, upload_id))
-
-    def _listed(self, key: str, upload_id: str) -> Iterator[tuple[int, Part]]:
         pages = self._client.get_paginator("list_parts")
-        for page in pages.paginate(Bucket=self._name, Key=key, UploadId=upload_id):
-            for one in page.get("Parts", ()):
-                sha256 = base64.b64decode(one["ChecksumSHA256"]).hex()
-                yield int(one["PartNumber"]), Part(one["Size"], one["ETag"], sha256)
+        return {
+            int(one["PartNumber"]): Part(one["ETag"], base64.b64decode(one["ChecksumSHA256"]).hex())
+            for page in pages.paginate(Bucket=self._name, Key=key, UploadId=upload_id)
+            for one in page.get("Parts", ())
+        }
 
     def address(self, key: str, file: File) -> Address:
         """The address to upload a whole file: fixed content, size and key, usable once."""
@@ -212,16 +210,9 @@ def answer(robot: str, request: FileRequest, bucket: Bucket, quota: Quota, now_s
 
 def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
     """The numbers as ranges, both ends inclusive."""
-    first = last = None
-    for number in sorted(numbers):
-        if last is not None and number == last + 1:
-            last = number
-            continue
-        if first is not None and last is not None:
-            yield first, last
-        first = last = number
-    if first is not None and last is not None:
-        yield first, last
+    for _, several in groupby(enumerate(sorted(numbers)), lambda placed: placed[1] - placed[0]):
+        row = [number for _, number in several]
+        yield row[0], row[-1]
 
 
 def _reply(topic: Topic, found: FileAnswer) -> None:

@@ -153,13 +153,6 @@ class Marks:
 _CHUNK = 1024 * 1024
 
 
-class Stored(NamedTuple):
-    """What an object has."""
-
-    sha256: str
-    size: int
-
-
 class Version(NamedTuple):
     """A version of an object, and when it was written."""
 
@@ -181,11 +174,6 @@ class Objects:
     def __init__(self, client: S3Client, bucket: str) -> None:
         self._client, self._bucket = client, bucket
 
-    def etag(self, key: str) -> str | None:
-        """The version that an object has now; None without an object."""
-        version = self.version(key)
-        return version.etag if version is not None else None
-
     def version(self, key: str) -> Version | None:
         """The version that an object has now; None without an object."""
         try:
@@ -206,9 +194,12 @@ class Objects:
         file.seek(0)
         return Read(file, answer["ETag"], digest.hexdigest())
 
-    def write(self, key: str, file: IO[bytes], etag: str | None) -> Stored:
-        """Write a file's content if the object still has this version; raises `ClientError` if it has not."""
-        condition: dict[str, Any] = {"IfNoneMatch": "*"} if etag is None else {"IfMatch": etag}
+    def write(self, key: str, file: IO[bytes], version: Version | None) -> tuple[str, int]:
+        """Write a file's content if the object still has this version; returns its SHA-256 and its size.
+
+        Raises `ClientError` if another version is there.
+        """
+        condition: dict[str, Any] = {"IfNoneMatch": "*"} if version is None else {"IfMatch": version.etag}
         digest = hashlib.sha256()
         file.seek(0)
         while chunk := file.read(_CHUNK):
@@ -218,7 +209,7 @@ class Objects:
         self._client.put_object(
             Bucket=self._bucket, Key=key, Body=file, ChecksumAlgorithm="SHA256", **condition
         )
-        return Stored(digest.hexdigest(), size)
+        return digest.hexdigest(), size
 
     def remove(self, key: str, etag: str) -> None:
         """Remove an object, unless it has been written again."""

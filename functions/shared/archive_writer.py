@@ -12,14 +12,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from tempfile import TemporaryFile
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 from functions.shared.archive import Archive
 from functions.shared.metrics import emit
 from iort_analysis.archive.hours import key_of, merged
 from iort_analysis.archive.reading import ArchiveFile
 from iort_analysis.archive.reading import items as archived_items
-from iort_analysis.archive.writing import described, write_day, write_hour
+from iort_analysis.archive.writing import Written, described, write_day, write_hour
 from iort_contract.archive import (
     ArchivedHour,
     Hour,
@@ -43,16 +43,17 @@ def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHou
     topic, hour = parse_topic(pending.topic), parse_hour(pending.period)
     due_ms = archive.marks.due_ms(pending)
     row = archive.row(pending.topic, hour)
-    etags = {key: archive.objects.etag(key) for key in (hour_key(topic, hour), refused_key(topic, hour))}
+    key, refused = hour_key(topic, hour), refused_key(topic, hour)
+    versions = {one: archive.objects.version(one) for one in (key, refused)}
     with ExitStack() as files:
-        made = _write(archive, pending, row, now_ms, files)
-        if made.batches + made.refused and (row is None or row.content != made.content):
+        file, set_aside, written = _write(archive, pending, row, now_ms, files)
+        aside = sum(written.refused.values())
+        if written.batches + aside and (row is None or row.content != written.content):
             sha256, size = "", 0
-            (key, etag), (refused, refused_etag) = etags.items()
-            if made.batches:
-                sha256, size = archive.objects.write(key, made.file, etag)
-            if made.refused:
-                archive.objects.write(refused, made.set_aside, refused_etag)
+            if written.batches:
+                sha256, size = archive.objects.write(key, file, versions[key])
+            if aside:
+                archive.objects.write(refused, set_aside, versions[refused])
             # The day's object, if there is one, is now old.
             archive.marks.add(Pending(pending.topic, hour.date), now_ms)
             before, row = (
@@ -60,49 +61,40 @@ def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHou
                 ArchivedHour(
                     topic=pending.topic,
                     hour=str(hour),
-                    key=key if made.batches else "",
-                    batches=made.batches,
-                    samples=made.samples,
-                    refused=made.refused,
-                    content=made.content,
+                    key=key if written.batches else "",
+                    batches=written.batches,
+                    samples=written.samples,
+                    refused=aside,
+                    content=written.content,
                     sha256=sha256,
                     size_bytes=size,
                     archived_ms=now_ms,
-                    first_expires_s=made.first_expires_s,
+                    first_expires_s=written.first_expires_s,
                 ),
             )
             _keep(archive, row, before)
             emit(
                 "archive",
                 HoursArchived=1,
-                SamplesArchived=made.samples,
+                SamplesArchived=written.samples,
                 BytesArchived=size,
-                ItemsSetAside=made.refused,
+                ItemsSetAside=aside,
             )
-        elif row is not None and made.first_expires_s != row.first_expires_s:
+        elif row is not None and written.first_expires_s != row.first_expires_s:
             # A batch that was sent twice expires by its last receipt, and the retention may be shorter now.
-            before, row = row, replace(row, first_expires_s=made.first_expires_s)
+            before, row = row, replace(row, first_expires_s=written.first_expires_s)
             _keep(archive, row, before)
     archive.marks.done(pending, due_ms, now_ms)
     return row
 
 
-class _Made(NamedTuple):
-    """An hour's files, and what they hold."""
-
-    file: IO[bytes]
-    set_aside: IO[bytes]
-    batches: int
-    samples: int
-    refused: int
-    content: str
-    first_expires_s: int
-
-
 def _write(
     archive: Archive, pending: Pending, row: ArchivedHour | None, now_ms: int, files: ExitStack
-) -> _Made:
-    """Write an hour's files. What the table no longer has comes from the archive, which must not shrink."""
+) -> tuple[IO[bytes], IO[bytes], Written]:
+    """Write an hour's file, and that of refused items.
+
+    What the table no longer has comes from the archive, which must not shrink.
+    """
     topic, hour = pending.topic, parse_hour(pending.period)
     with_archived = row is not None and 0 < row.first_expires_s <= now_ms / 1000 + _MARGIN_S
     while True:
@@ -122,10 +114,8 @@ def _write(
             describe=described(parse_topic(topic).name),
         )
         if row is None or with_archived or written.content == row.content:
-            count = sum(written.refused.values())
             expiries += [written.first_expires_s] if written.first_expires_s else []
-            first_s = min(expiries, default=0)
-            return _Made(into, refused, written.batches, written.samples, count, written.content, first_s)
+            return into, refused, written._replace(first_expires_s=min(expiries, default=0))
         # Something is new. Whether something is missing as well tells only the archive.
         with_archived = True
 
@@ -183,7 +173,7 @@ def join_day(archive: Archive, pending: Pending, now_ms: int) -> bool:
     size = sum({row.key: row.size_bytes for row in rows}.values())
     joined, joins = all(row.key == key for row in rows), dict[str, str]()
     if not joined and len(rows) > 1 and size <= MOST_BYTES:
-        etag = archive.objects.etag(key)
+        version = archive.objects.version(key)
         with ExitStack() as files:
             found = {one: archive.objects.read(one) for one in sorted({row.key for row in rows})}
             opened = {one: ArchiveFile(files.enter_context(read.file)) for one, read in found.items()}
@@ -196,25 +186,17 @@ def join_day(archive: Archive, pending: Pending, now_ms: int) -> bool:
                 into,
                 describe=described(topic.name),
             )
-            stored = archive.objects.write(key, into, etag)
+            sha256, size = archive.objects.write(key, into, version)
         changes: list[Any] = []
         for row in rows:
-            item = {**row.item(), "key": {"S": key}}
-            item.update({"sha256": {"S": stored.sha256}, "size_bytes": {"N": str(stored.size)}})
-            changes.append(
-                {
-                    "Put": {
-                        "TableName": archive.manifest.name,
-                        "Item": item,
-                        "ConditionExpression": "content = :content AND #key = :key",
-                        "ExpressionAttributeNames": {"#key": "key"},
-                        "ExpressionAttributeValues": {
-                            ":content": {"S": row.content},
-                            ":key": {"S": row.key},
-                        },
-                    }
-                }
-            )
+            put = {
+                "TableName": archive.manifest.name,
+                "Item": replace(row, key=key, sha256=sha256, size_bytes=size).item(),
+                "ConditionExpression": "content = :content AND #key = :key",
+                "ExpressionAttributeNames": {"#key": "key"},
+                "ExpressionAttributeValues": {":content": {"S": row.content}, ":key": {"S": row.key}},
+            }
+            changes.append({"Put": put})
         archive.client.transact_write_items(TransactItems=changes)
         emit("archive", DaysJoined=1)
         joined, joins = True, {one: read.etag for one, read in found.items()}

@@ -17,7 +17,7 @@ from moto import mock_aws
 from iort_contract.archive import ARCHIVE_PREFIX
 from stacks.settings import CONTEXT_KEYS, ROOT
 from stacks.variations import FLIPS, KEY, NOT_FLIPPED, VARIATIONS
-from tests.stacks.templates import create_only, identity, is_replaced, name
+from tests.stacks.templates import create_only, identity, is_replaced
 
 Templates = dict[str, dict[str, Any]]
 
@@ -179,16 +179,6 @@ def holding_data(app):
     ]
 
 
-def test_dev_deletes_data_with_its_stacks(synthesized):
-    for resource in holding_data(synthesized):
-        assert (resource["DeletionPolicy"], resource["UpdateReplacePolicy"]) == ("Delete", "Delete"), resource
-    for table in synthesized.resources("AWS::DynamoDB::Table").values():
-        assert not table["DeletionProtectionEnabled"]
-    assert not synthesized.protected
-    assert not synthesized.resources("AWS::KMS::Key")
-    assert not synthesized.resources("AWS::Budgets::Budget")
-
-
 def test_prod_retains_data(production):
     for resource in holding_data(production):
         assert (resource["DeletionPolicy"], resource["UpdateReplacePolicy"]) == ("Retain", "Retain"), resource
@@ -196,30 +186,6 @@ def test_prod_retains_data(production):
         assert table["DeletionProtectionEnabled"]
         assert table["PointInTimeRecoverySpecification"] == {"PointInTimeRecoveryEnabled": True}
     assert production.protected == set(production.templates)
-
-
-def test_the_stages_have_the_same_resources_but_for_key_and_budget(synthesized, production):
-    def resources(app):
-        return {
-            (noun, name(logical_id), resource["Type"])
-            for noun, template in app.templates.items()
-            for logical_id, resource in template["Resources"].items()
-        }
-
-    more = {(stack, kind) for stack, _, kind in resources(production) - resources(synthesized)}
-    assert more >= {("storage", "AWS::KMS::Key"), ("monitoring", "AWS::Budgets::Budget")}
-    assert sorted(resources(synthesized) - resources(production)) == []
-
-
-def test_every_taggable_resource_has_the_configured_tags(production):
-    for template in production.templates.values():
-        for logical_id, resource in template["Resources"].items():
-            tags = resource.get("Properties", {}).get("Tags")
-            if isinstance(tags, list):
-                assert {"Key": "team", "Value": "lab"} in tags, logical_id
-                assert {"Key": "stage", "Value": "prod"} in tags, logical_id
-                assert {"Key": "project", "Value": "iort"} in tags, logical_id
-    assert json.dumps(production.templates).count('"team"') > 20
 
 
 # The commands of docs/how-to/restore.md bring back what was deleted and what was replaced.
