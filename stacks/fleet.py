@@ -25,16 +25,6 @@ from stacks.storage import Storage
 _COGNITO = "cognito-identity.amazonaws.com"
 
 
-def viewer(stack: PlatformStack) -> None:
-    """The role of a viewer, who sees every car and may ask it for its live messages (`VIEW`)."""
-    _person(stack, VIEWER, publishes=[VIEW])
-
-
-def driver(stack: PlatformStack) -> None:
-    """The role of a driver: a viewer who may also send commands."""
-    _person(stack, DRIVER, publishes=[VIEW, CMD])
-
-
 def public_identity(stack: PlatformStack) -> None:
     """The identity of the page on the web: anybody gets one, without a password, and it only listens.
 
@@ -206,7 +196,7 @@ def _arns(stack: Stack, kind: str, *names: str) -> list[str]:
 
 class Fleet(PlatformStack):
     """The resources to register robots. One policy serves all robots: its variables restrict each certificate
-    to the topics of its thing. Viewers and drivers have roles (`stacks.fleet`).
+    to the topics of its thing. Viewers and drivers have roles.
 
     The function Admit decides if a claim may have the name it asks for; ``presence`` keeps the robots' rows.
     """
@@ -255,9 +245,10 @@ class Fleet(PlatformStack):
         # RegisterThing needs them: AWS tests role and hook when it creates the template.
         for needed in (robot_type, robots, policy, role, asking):
             template.node.add_dependency(needed)
-        viewer(self)
+        # A viewer sees every car, and may ask it for its live messages; a driver also sends commands.
+        _person(self, VIEWER, publishes=[VIEW])
         if settings.drivers:
-            driver(self)
+            _person(self, DRIVER, publishes=[VIEW, CMD])
         if settings.public:
             public_identity(self)
         CfnOutput(self, "LiveTransport", value=settings.live_transport)

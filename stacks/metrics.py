@@ -22,13 +22,25 @@ from iort_contract.catalog.metrics import (
 )
 
 PERIOD = Duration.minutes(1)
-_FUNCTION_STATISTICS = {"Duration": "p95", "ConcurrentExecutions": "Maximum", "IteratorAge": "Maximum"}
+WAITING = "ApproximateNumberOfMessagesVisible"
+# The others are sums.
+_STATISTICS = {
+    "Duration": "p95",
+    **dict.fromkeys(("ConcurrentExecutions", "IteratorAge", WAITING), "Maximum"),
+}
+# By the kind of a resource: namespace, dimension, and the attribute with its value.
+_OF = {
+    lambda_.Function: ("AWS/Lambda", "FunctionName", "function_name"),
+    dynamodb.Table: ("AWS/DynamoDB", "TableName", "table_name"),
+    sqs.Queue: ("AWS/SQS", "QueueName", "queue_name"),
+    stepfunctions.StateMachine: ("AWS/States", "StateMachineArn", "state_machine_arn"),
+}
 
 
 def ours(metric: Metric, namespace: str) -> cloudwatch.Metric:
     """A metric that functions/ emits."""
     dimensions = {METRIC_DEPLOYMENT: namespace, METRIC_FUNCTION: metric.function}
-    return _metric(METRIC_NAMESPACE, metric.name, dimensions, statistic=metric.statistic)
+    return aws(METRIC_NAMESPACE, metric.name, dimensions, statistic=metric.statistic)
 
 
 def each_robot(metric: Metric, namespace: str) -> cloudwatch.MathExpression:
@@ -45,29 +57,34 @@ def each_robot(metric: Metric, namespace: str) -> cloudwatch.MathExpression:
     )
 
 
-def rule(name: str, rule_name: str, *, label: str) -> cloudwatch.Metric:
-    """A metric of a topic rule, by its physical name."""
-    return _metric("AWS/IoT", name, {"RuleName": rule_name}, label=label)
-
-
-def broker(name: str) -> cloudwatch.Metric:
-    """A metric of the account's message broker."""
-    return _metric("AWS/IoT", name, {"Protocol": "MQTT"})
-
-
-def function(
-    name: str, of: lambda_.IFunction | None = None, *, label: str | None = None
+def aws(
+    namespace: str,
+    name: str,
+    dimensions: dict[str, str] | None = None,
+    *,
+    label: str | None = None,
+    statistic: str | None = None,
 ) -> cloudwatch.Metric:
-    """A metric of a Lambda function; without one of all functions of the account, which has no dimensions."""
-    dimensions = {"FunctionName": of.function_name} if of else {}
-    return _metric(
-        "AWS/Lambda", name, dimensions, label=label, statistic=_FUNCTION_STATISTICS.get(name, "Sum")
+    """A metric of a service; without dimensions of all the account."""
+    return cloudwatch.Metric(
+        namespace=namespace,
+        metric_name=name,
+        dimensions_map=dimensions or {},
+        statistic=statistic or _STATISTICS.get(name, "Sum"),
+        period=PERIOD,
+        label=label,
     )
 
 
-def table(name: str, of: dynamodb.ITable, *, label: str | None = None) -> cloudwatch.Metric:
-    """A metric of a DynamoDB table."""
-    return _metric("AWS/DynamoDB", name, {"TableName": of.table_name}, label=label)
+def of(
+    resource: lambda_.Function | dynamodb.Table | sqs.Queue | stepfunctions.StateMachine,
+    name: str,
+    *,
+    label: str | None = None,
+) -> cloudwatch.Metric:
+    """The service's metric of a resource."""
+    namespace, dimension, attribute = _OF[type(resource)]
+    return aws(namespace, name, {dimension: getattr(resource, attribute)}, label=label)
 
 
 def of_the_account(namespace: str, name: str) -> cloudwatch.MathExpression:
@@ -77,33 +94,4 @@ def of_the_account(namespace: str, name: str) -> cloudwatch.MathExpression:
         expression=f'SELECT SUM({name}) FROM "{namespace}"',  # noqa: S608 - no database is asked
         using_metrics={},
         period=PERIOD,
-    )
-
-
-def machine(name: str, of: stepfunctions.IStateMachine) -> cloudwatch.Metric:
-    """A metric of a state machine."""
-    return _metric("AWS/States", name, {"StateMachineArn": of.state_machine_arn})
-
-
-def waiting(of: sqs.IQueue, *, label: str | None = None) -> cloudwatch.Metric:
-    """How many messages wait in a queue."""
-    name = "ApproximateNumberOfMessagesVisible"
-    return _metric("AWS/SQS", name, {"QueueName": of.queue_name}, label=label, statistic="Maximum")
-
-
-def _metric(
-    namespace: str,
-    name: str,
-    dimensions: dict[str, str],
-    *,
-    label: str | None = None,
-    statistic: str = "Sum",
-) -> cloudwatch.Metric:
-    return cloudwatch.Metric(
-        namespace=namespace,
-        metric_name=name,
-        dimensions_map=dimensions,
-        statistic=statistic,
-        period=PERIOD,
-        label=label,
     )

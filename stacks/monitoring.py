@@ -75,18 +75,18 @@ class Alarms(Construct):
         self._settings = settings
         self._tell = actions.SnsAction(topic)
         for name, queue in watched.queues.items():
-            self._add(f"{name}Waiting", metrics.waiting(queue))
+            self._add(f"{name}Waiting", metrics.of(queue, metrics.WAITING))
         for name, function in watched.functions.items():
-            self._add(f"{name}Errors", metrics.function("Errors", function).with_(period=_FIVE_MINUTES))
+            self._add(f"{name}Errors", metrics.of(function, "Errors").with_(period=_FIVE_MINUTES))
         for name, table in watched.tables.items():
-            throttled = metrics.table("WriteThrottleEvents", table).with_(period=_FIVE_MINUTES)
+            throttled = metrics.of(table, "WriteThrottleEvents").with_(period=_FIVE_MINUTES)
             self._add(f"{name}Throttled", throttled)
-        written = metrics.table("ConsumedWriteCapacityUnits", watched.tables["Batches"])
+        written = metrics.of(watched.tables["Batches"], "ConsumedWriteCapacityUnits")
         self._add("BatchesVolume", written.with_(period=Duration.hours(1)))
         for name, reader in watched.readers.items():
-            self._add(f"{name}Behind", metrics.function("IteratorAge", reader))
+            self._add(f"{name}Behind", metrics.of(reader, "IteratorAge"))
         for name, machine in watched.machines.items():
-            self._add(f"{name}Failed", metrics.machine("ExecutionsFailed", machine))
+            self._add(f"{name}Failed", metrics.of(machine, "ExecutionsFailed"))
         for metric in METRICS.values():
             if metric.alarm:
                 self._add(metric.name, metrics.ours(metric, settings.namespace))
@@ -184,22 +184,24 @@ class Dashboards(Construct):
         return [metrics.ours(metric, self._namespace) for metric in shown]
 
     def _broker_and_rules(self) -> list[cloudwatch.GraphWidget]:
-        refused = [metrics.broker(f"{what}.AuthError") for what in ("Connect", "PublishIn", "Subscribe")]
-        matched = [
-            metrics.rule("TopicMatch", rule.physical_name(self._namespace), label=rule.name)
-            for rule in self._rules
-        ]
+        names = {rule.name: {"RuleName": rule.physical_name(self._namespace)} for rule in self._rules}
+        matched = [metrics.aws("AWS/IoT", "TopicMatch", of, label=label) for label, of in names.items()]
+
+        def broker(name: str) -> cloudwatch.Metric:
+            return metrics.aws("AWS/IoT", name, {"Protocol": "MQTT"})
+
+        refused = [broker(f"{what}.AuthError") for what in ("Connect", "PublishIn", "Subscribe")]
         return [
             _graph(
                 "Broker: connections and messages, all of the account",
-                [metrics.broker(f"{what}.Success") for what in ("Connect", "PublishIn", "PublishOut")],
-                right=[*refused, metrics.broker("PublishIn.Throttle")],
+                [broker(f"{what}.Success") for what in ("Connect", "PublishIn", "PublishOut")],
+                right=[*refused, broker("PublishIn.Throttle")],
             ),
             _graph("Rules: messages matched", matched),
         ]
 
     def _queues(self, watched: Watched) -> cloudwatch.GraphWidget:
-        waiting = [metrics.waiting(queue, label=label) for label, queue in watched.queues.items()]
+        waiting = [metrics.of(queue, metrics.WAITING, label=label) for label, queue in watched.queues.items()]
         return _graph(QUEUES_CHART, waiting, self._ours(QUEUES_CHART, right=True))
 
 
@@ -225,7 +227,7 @@ def _tables(watched: Watched) -> cloudwatch.GraphWidget:
     return _graph(
         "Tables: capacity units",
         [
-            metrics.table(name, watched.tables[table], label=f"{table} {what}")
+            metrics.of(watched.tables[table], name, label=f"{table} {what}")
             for name, what in units.items()
             for table in _TABLES_OF_SAMPLES
         ],
@@ -235,12 +237,12 @@ def _tables(watched: Watched) -> cloudwatch.GraphWidget:
 def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
     running = "ConcurrentExecutions"
     durations = [
-        metrics.function("Duration", of, label=label)
+        metrics.of(of, "Duration", label=label)
         for label, of in watched.functions.items()
         if label not in _IN_THE_BACKGROUND
     ]
     concurrency = [
-        metrics.function(running, watched.functions[name], label=name)
+        metrics.of(watched.functions[name], running, label=name)
         for name in _FUNCTIONS_OF_SAMPLES
         if name in watched.functions
     ]
@@ -248,11 +250,11 @@ def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
         _graph("Functions: duration p95, ms", durations),
         _graph(
             "Functions: concurrency",
-            [metrics.function(running, label="all of the account"), *concurrency],
+            [metrics.aws("AWS/Lambda", running, label="all of the account"), *concurrency],
         ),
         _graph(
             "Functions: errors and throttles, all of the account",
-            [metrics.function("Errors"), metrics.function("Throttles")],
+            [metrics.aws("AWS/Lambda", name) for name in ("Errors", "Throttles")],
         ),
     ]
 
@@ -260,7 +262,7 @@ def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
 def _iterator_age(watched: Watched) -> cloudwatch.GraphWidget:
     return _graph(
         "Streams: iterator age, ms",
-        [metrics.function("IteratorAge", of, label=label) for label, of in watched.readers.items()],
+        [metrics.of(of, "IteratorAge", label=label) for label, of in watched.readers.items()],
     )
 
 

@@ -2,7 +2,7 @@
 
 tests/local/identity/test_isolation.py tries every row on the embedded cloud with enforcement on, and
 tests/stacks/test_isolation.py asks the synthesized policies. roles.py there declares the
-permissions of each role. This table asks all roles, so that a new function without a declaration fails.
+permissions of each role, and test_policies.py that no role has others.
 """
 
 from __future__ import annotations

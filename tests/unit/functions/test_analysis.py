@@ -518,21 +518,6 @@ def test_a_field_that_comes_later_tells_of_motion(cloud: Deployed) -> None:
     assert planned["motion"] == "vesc"
 
 
-def test_a_speed_is_in_the_unit_of_its_stream(cloud: Deployed) -> None:
-    """A field named speed is in erpm where a motor controller has it, and in m/s elsewhere."""
-    times = START_US + np.arange(300 * 10, dtype=np.int64) * 100_000
-    # Two drives at 1.5 m/s, and a minute and a half between them.
-    there = (times - START_US) // S
-    speed = np.where((there > 20) & (there < 100) | (there > 200) & (there < 280), 1.5, 0.0)
-    cloud.register(CAR, "base", "told")
-    cloud.record({"base": Block(times, {"speed": speed, "steering_angle": speed / 10})})
-
-    planned = cloud.run()
-
-    assert [one["motion"] for one in planned] == ["base", "base"]
-    assert [(one["start_us"] - START_US) // S for one in planned] == [11, 191]
-
-
 def test_a_robot_that_records_and_never_moves_is_a_finding(cloud: Deployed) -> None:
     vesc = streams(90)["vesc"]
     # Its speed is in m/s, though its stream is a motor controller's.
