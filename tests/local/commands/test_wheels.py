@@ -64,8 +64,8 @@ def test_an_installed_car_can_be_driven_queried_and_watched(agent, station, clou
                 assert "<title>" in page.read().decode()
             with urlopen(f"{url}page.js") as script:
                 assert script.read()
-            with urlopen(f"{url}config.json") as told:
-                assert "wheels" in json.load(told)["vehicles"]
+            with urlopen(f"{url}vehicles.json") as vehicles:
+                assert "wheels" in json.load(vehicles)["vehicles"]
         finally:
             dashboard.terminate()
     station.run("iort", "robots", "remove", "wheels", "--yes", **cloud)
