@@ -105,6 +105,11 @@ def _is_text(value: str) -> bool:
         return False
 
 
+def check_id(value: object, what: str) -> str:
+    """Return the value if it is the name of a run, a session or a request."""
+    return checked(BOOT, value, what, "8 to 32 of 0-9 a-f")
+
+
 def check_version(envelope: Mapping[str, Any], known: int = SCHEMA_VERSION) -> None:
     """Refuse every schema version but this side's."""
     version = integer(envelope, "v")
@@ -114,19 +119,14 @@ def check_version(envelope: Mapping[str, Any], known: int = SCHEMA_VERSION) -> N
 
 def check_header(boot: Any, seq: Any, nonfinite: Any) -> str:
     """Return the run's name, if it and both counts are valid."""
-    if not isinstance(boot, str) or not BOOT.fullmatch(boot):
-        raise ContractError(f"boot must be 8 to 32 of 0-9 a-f, got {shown(boot)}")
-    if type(seq) is not int or not 0 <= seq <= MAX_SEQ:
-        raise ContractError(f"seq must be an integer from 0, got {shown(seq)}")
+    whole_number("seq", seq, 0, MAX_SEQ)
     check_nonfinite(nonfinite)
-    return boot
+    return check_id(boot, "boot")
 
 
 def check_nonfinite(nonfinite: Any) -> int:
     """Return the count of values that are not finite, if it is valid."""
-    if type(nonfinite) is not int or not 0 <= nonfinite <= MAX_SAMPLES * MAX_FIELDS:
-        raise ContractError(f"{NONFINITE} must be an integer from 0, got {shown(nonfinite)}")
-    return nonfinite
+    return whole_number(NONFINITE, nonfinite, 0, MAX_SAMPLES * MAX_FIELDS)
 
 
 def check_time(t_us: Any, what: str) -> int:

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from typing import Any, Mapping
 
 from iort_contract.checks import (
-    BOOT,
     FIELD_NAME,
     check_header,
+    check_id,
     check_time,
     checked,
     offset_entry,
@@ -87,7 +87,7 @@ def check_by(by: Any) -> str:
 
 
 def _check_command(command: Command) -> None:
-    checked(BOOT, command.session, "session", "8 to 32 of 0-9 a-f")
+    check_id(command.session, "session")
     check_header(command.session, command.seq, 0)
     if command.by is not None:
         check_by(command.by)

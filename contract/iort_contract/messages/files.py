@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Mapping, NamedTuple, Sequence
 
-from iort_contract.checks import BOOT, check_time, checked, shown, whole_number
+from iort_contract.checks import BOOT, check_id, check_time, checked, shown, whole_number
 from iort_contract.limits import ContractError
 from iort_contract.messages.envelope import codec, each, read
 from iort_contract.topics import check_robot
@@ -167,7 +167,7 @@ def _addresses(content: Any) -> tuple[Address, ...]:
 
 
 def _check_file_answer(answer: FileAnswer) -> None:
-    checked(BOOT, answer.id, "id", "8 to 32 of 0-9 a-f")
+    check_id(answer.id, "id")
     if answer.again_s is not None:
         whole_number("again_s", answer.again_s, 0, _MAX_WAIT_S)
     if answer.refused is None and answer.key is None:
@@ -191,7 +191,7 @@ def _parts(content: Any) -> dict[int, Any]:
 
 
 def _check_file_request(request: FileRequest) -> None:
-    checked(BOOT, request.id, "id", "8 to 32 of 0-9 a-f")
+    check_id(request.id, "id")
     file = _check_file(request.file)
     if len(request.parts) > MAX_ADDRESSES:
         raise ContractError(f"parts must be at most {MAX_ADDRESSES}, got {len(request.parts)}")

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple
 
 from iort_contract.checks import (
-    BOOT,
     COMPACT,
     MAX_SEQ,
     check_header,
+    check_id,
     check_time,
     check_version,
-    checked,
     integer,
     json_object,
     offset_entry,
@@ -165,13 +164,9 @@ def decode_live_update(message: Any) -> LiveUpdate:
 
 def encode_ping(ping_id: int, sent_us: int, padding: str = "") -> bytes:
     """A ping; the pong repeats it and adds the cloud's ``received_ms``."""
-    if type(ping_id) is not int or not 0 <= ping_id <= MAX_SEQ:
-        raise ContractError(f"ping id must be an integer from 0, got {shown(ping_id)}")
-    ping: dict[str, Any] = {"v": SCHEMA_VERSION, "id": ping_id}
-    ping["sent_us"] = check_time(sent_us, "sent_us")
-    if padding:
-        ping["padding"] = padding
-    return to_json(ping)
+    whole_number("ping id", ping_id, 0, MAX_SEQ)
+    ping = {"v": SCHEMA_VERSION, "id": ping_id, "sent_us": check_time(sent_us, "sent_us")}
+    return to_json({**ping, "padding": padding} if padding else ping)
 
 
 class Pong(NamedTuple):
@@ -218,7 +213,7 @@ def lease_topic(robot: str, namespace: str) -> str:
 
 
 def _check(lease: Lease) -> None:
-    checked(BOOT, lease.viewer, "viewer", "8 to 32 of 0-9 a-f")
+    check_id(lease.viewer, "viewer")
     if not LIVE_MIN_RATE_HZ <= lease.rate_hz <= LIVE_MAX_RATE_HZ:
         raise ContractError(
             f"rate_hz must be {LIVE_MIN_RATE_HZ:g} to {LIVE_MAX_RATE_HZ:g}, got {shown(lease.rate_hz)}"

@@ -10,19 +10,19 @@ from itertools import accumulate
 from typing import Any, Mapping, NamedTuple, Sequence
 
 from iort_contract.checks import (
-    BOOT,
+    check_id,
     check_time,
     check_version,
-    checked,
     integer,
     json_object,
     offset_entry,
     shown,
     text,
+    whole_number,
 )
 from iort_contract.limits import SCHEMA_VERSION, ContractError, Value
 from iort_contract.messages.envelope import entries, read, to_json
-from iort_contract.messages.files import check_sha256, parse_file_key
+from iort_contract.messages.files import MAX_FILE_BYTES, check_sha256, parse_file_key
 from iort_contract.topics import check_robot, check_stream
 
 # A larger question or answer travels as a file in the bucket, and the message names the file.
@@ -115,9 +115,7 @@ def decode_ask(message: bytes | str) -> Ask:
     """Decode a question; raises `ContractError` for everything that `encode_ask` cannot have written."""
     envelope = json_object(message, "question")
     check_version(envelope)
-    valid_ms = integer(envelope, "valid_ms")
-    if not 1 <= valid_ms <= MAX_ASK_MS:
-        raise ContractError(f"valid_ms must be 1 to {MAX_ASK_MS}, got {valid_ms}")
+    valid_ms = whole_number("valid_ms", integer(envelope, "valid_ms"), 1, MAX_ASK_MS)
     offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
     offset_entry(offset_us)
     body = _body(envelope, "file", "key")
@@ -159,15 +157,13 @@ def decode_answer(message: bytes | str) -> Answer:
 
 
 def _id(envelope: Mapping[str, Any]) -> str:
-    return checked(BOOT, envelope.get("id"), "id", "8 to 32 of 0-9 a-f")
+    return check_id(envelope.get("id"), "id")
 
 
 def _body(envelope: Mapping[str, Any], large: str, place: str) -> Mapping[str, Any] | Content:
     file = envelope.get(large)
     if isinstance(file, Mapping):
-        size = integer(file, "size")
-        if size < 0:
-            raise ContractError(f"size must be from 0, got {size}")
+        size = whole_number("size", integer(file, "size"), 0, MAX_FILE_BYTES)
         return Content(text(file, place), check_sha256(file.get("sha256")), size)
     body = envelope.get("body")
     if not isinstance(body, dict):

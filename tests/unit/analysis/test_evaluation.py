@@ -43,10 +43,7 @@ def test_a_worn_battery_is_found_with_its_numbers() -> None:
     (finding,) = evaluate([result(0.045)], drives(USUAL), [])
     assert (finding.kind, finding.subject, finding.stream) == ("battery_worn", NAME, "vesc")
     assert finding.fields == ("voltage_input", "current_input")
-    assert finding.effect is not None
     assert finding.effect.low < 0.015 < finding.effect.high
-    assert finding.q is not None
-    assert finding.p is not None
     assert finding.p <= finding.q < 0.01
     assert (
         "0.045 ohm (0.044 to 0.046), 50% above its own baseline of 0.03 ohm over 5 earlier drives"

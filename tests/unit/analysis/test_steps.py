@@ -79,5 +79,4 @@ def test_whole_drives_take_the_fast_way():
     run = [steps_of(read_envelope(json.loads(encode_batch(batch)))) for batch in batches]
     assert None not in run
     block = decode_steps(run, lambda name: name == "a")
-    assert block is not None
     assert block.columns["a"].tolist() == [0, 2.5, 1, 2.5, 2, 2.5]

@@ -355,7 +355,10 @@ def test_samples_that_are_not_base64_are_refused(text):
         ({"n": Decimal("NaN")}, "n must be an integer, got Decimal"),
         ({"n": 10**5000}, "n must be an integer, got <int>"),
         ({"batch": f"{2**53:016}-{BOOT}-4"}, "got 9007199254740992"),
-        ({"batch": f"{0:016}-{BOOT}-{2**53 + 1}"}, "seq must be an integer from 0, got 9007199254740993"),
+        (
+            {"batch": f"{0:016}-{BOOT}-{2**53 + 1}"},
+            "seq must be an integer from 0 to 9007199254740992, got 9007199254740993",
+        ),
         ({"batch": f"{0:016}-{'0' * 33}-4"}, "got '0000000000000000-0000"),
         ({"nonfinite": b"0"}, "nonfinite must be an integer, got b'0'"),
         ({"nonfinite": None}, "nonfinite must be an integer, got None"),

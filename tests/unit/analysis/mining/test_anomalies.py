@@ -95,10 +95,8 @@ def test_a_fault_that_comes_and_goes_is_an_event(
     if kind == "sensor_stuck":
         assert (event.start_us - drive.key.start_us) / 1e6 == pytest.approx(100, abs=0.1)
         assert "the value of current_motor stayed the same for 15 s" in event.text
-        assert event.effect is not None
         assert event.effect.low <= 15 <= event.effect.high < 15.1
     elif kind == "cell_dropout":
-        assert event.effect is not None
         assert event.effect.value == pytest.approx(0.8, abs=0.05)
 
 
@@ -178,7 +176,6 @@ def test_samples_that_come_again_are_an_intermittent_link() -> None:
     made["vesc"] = Block(times, {name: column[place] for name, column in columns.items()})
     (event,) = anomalies.mine(build(KEY, made)).events
     assert event.kind == "can_intermittent"
-    assert event.effect is not None
     assert event.effect.value == pytest.approx(0.035, abs=0.01)
 
 

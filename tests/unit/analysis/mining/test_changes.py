@@ -34,7 +34,6 @@ def test_a_change_is_found_with_its_place_and_size() -> None:
         values = alike(0.3, 120, seed)
         values[80:] += 3.0
         found = changed(values, "V")
-        assert found is not None
         assert found.p < 1e-3
         assert abs(found.place - 80) < 8
         held += found.effect.low < 3.0 < found.effect.high
@@ -45,8 +44,6 @@ def test_a_change_is_found_with_its_place_and_size() -> None:
 def test_a_change_follows_the_scale(scale: float, shift: float) -> None:
     values = alike(0.3, 60, 1)
     one, other = changed(values, "V"), changed(scale * values + shift, "V")
-    assert one is not None
-    assert other is not None
     assert other.place == one.place
     assert other.p == pytest.approx(one.p, rel=1e-6)
     assert other.effect.value == pytest.approx(scale * one.effect.value, rel=1e-6)
@@ -65,5 +62,4 @@ def test_friction_that_begins_on_the_way_is_found_at_its_time() -> None:
     found = anomalies.mine(build(spec.key, simulated(spec, None).streams)).events
     (event,) = [one for one in found if one.kind == "friction_added"]
     assert (event.start_us - spec.key.start_us) / 1e6 == pytest.approx(180, abs=15)
-    assert event.p is not None
     assert event.p < 1e-4

@@ -24,7 +24,6 @@ def test_intervals_hold_although_neighbouring_errors_are_alike() -> None:
         x = lagged(chance.normal(size=3000), 20)
         y = 2 * x + lagged(chance.normal(size=3000), 20)
         found = fit([x, np.ones(3000)], y)
-        assert found is not None
         slope = found.of(0, "1")
         held += slope.low < 2 < slope.high
         (value, _), covariance = np.polyfit(x, y, 1, cov=True)
@@ -42,8 +41,6 @@ def test_a_reading_stands_for_all_that_rounds_to_it() -> None:
         value = chance.uniform(11, 12) - 0.03 * load + chance.normal(0, 0.02, 4000)
         columns, rounded = [np.ones(4000), -load], value.round(1)
         one, other = fit(columns, rounded), fit(columns, rounded, resolution=resolution(rounded))
-        assert one is not None
-        assert other is not None
         plain += one.of(1, "ohm").low < 0.03 < one.of(1, "ohm").high
         aware += other.of(1, "ohm").low < 0.03 < other.of(1, "ohm").high
 
@@ -57,12 +54,10 @@ def test_outliers_weigh_nothing_and_a_prior_decides_what_the_data_does_not() -> 
     y[::25] += 50
     noisy = y + np.random.default_rng(1).normal(0, 0.01, 500)
     found = fit([x], noisy)
-    assert found is not None
     assert found.coefficients[0] == pytest.approx(3, abs=0.01)
 
     assert fit([x, 2 * x], noisy) is None
     told = fit([x, 2 * x], noisy, priors={1: Prior(1.0, 0.1)})
-    assert told is not None
     assert told.coefficients == pytest.approx([1, 1], abs=0.02)
     # A prior's deviation is known, unlike one that the spread of twenty blocks tells.
     assert told.of(1, "1").high - told.of(1, "1").low == pytest.approx(2 * 1.645 * 0.1, rel=0.002)
@@ -92,8 +87,6 @@ def test_values_between_two_readings_share_the_error_of_the_one_between_them() -
         way = chance.uniform(0.5, 1.5, 600)
         seen = 3 * way + np.diff(chance.normal(0, 0.1, 601))
         found, other = fit([way], seen, shared=True), fit([way], seen)
-        assert found is not None
-        assert other is not None
         widths.append(found.covariance[0, 0])
         plain.append(other.covariance[0, 0])
         apart.append(found.coefficients[0] - 3)
@@ -109,8 +102,6 @@ def test_another_model_of_the_same_samples_counts_if_it_differs_beyond_chance() 
     for bend, holds in ((0.0, False), (0.2, True)):
         y = 2 * x + bend * x**2 + noise
         line, curve = fit([x], y), fit([x, x**2], y)
-        assert line is not None
-        assert curve is not None
         before, after = line.of(0, "1"), line.beside([curve], [0]).of(0, "1")
         # At the origin the slope is 2, on the whole it is more: the interval holds both.
         assert (after.high - after.low > before.high - before.low) is holds
@@ -124,7 +115,6 @@ def test_an_interval_is_never_narrower_than_the_step_in_which_values_are_reporte
     constant = np.full(400, value)
     assert quantum(constant) == pytest.approx(step)
     found = fit([np.ones(400)], constant)
-    assert found is not None
     of_fit = found.of(0, "s")
     of_mean = mean_of(constant)
     for low, high in ((of_fit.low, of_fit.high), of_mean[1:]):

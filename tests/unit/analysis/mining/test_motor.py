@@ -139,7 +139,6 @@ def test_a_payload_and_a_brake_that_drags_are_told_apart() -> None:
 def test_a_position_that_comes_from_the_motors_speed_is_no_second_source() -> None:
     drive = proven(0).drive
     seconds, speed = drive.seconds, drive.of("vesc", "speed")
-    assert speed is not None
     way = np.append(0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(seconds))) / 4614.0
     odometry = drive.samples._replace(columns={"x": way, "y": 0 * way, "heading": 0 * way})
     mined = drivetrain.mine(replace(drive, streams={**drive.streams, "pose": odometry}))
@@ -161,7 +160,6 @@ def test_a_speed_in_the_log_is_a_second_source_of_the_gain(
     """One that is calculated from the motor's own speed says what somebody has entered, and no more."""
     drive = replace(proven(0).drive, pose=None, vehicle=None)
     speed = drive.of("vesc", "speed")
-    assert speed is not None
     mps = speed / 1062 + np.random.default_rng(1).normal(0, noise_mps, len(speed))
     columns = {**drive.samples.columns, field: mps}
     streams = {"vesc": drive.streams["vesc"]}
@@ -170,7 +168,6 @@ def test_a_speed_in_the_log_is_a_second_source_of_the_gain(
     gain = drivetrain.mine(told).estimates["speed_to_erpm_gain"]
     assert gain.value == pytest.approx(1062, rel=1e-3)
     assert (gain.high - gain.low) / 2 / 1062 == pytest.approx(share, abs=0.005)
-    assert told.vehicle is not None
     assert told.of("vesc", "speed_mps") == pytest.approx(speed / told.vehicle.speed_to_erpm_gain)
 
 

@@ -68,8 +68,6 @@ def again(batch: Batch, layouts: Any = None) -> list[bytes]:
     """The messages decoded from the wire's batch and from a table's item."""
     message = encode_batch(batch)
     _, messages = messages_of(message, LAYOUTS if layouts is None else layouts)
-    assert messages is not None
-    assert batch.messages is not None
     assert messages.type_id == batch.messages.type_id
     return list(messages.raw)
 
@@ -371,7 +369,6 @@ def test_columns_beside_messages_are_part_of_their_samples() -> None:
     batch = batch_of(NAMES, raws, {"data.key": ["k", None], "data.at": [0, 4]})
     found, messages = messages_of(encode_batch(batch), {})
     assert found.columns == {"names.0": [None, "a"], "data.key": ["k", None], "data.at": [0, 4]}
-    assert messages is not None
     assert list(messages.raw) == raws
     # Numeric messages, too.
     numbers = batch_of(FLAT, [flat()], {"note": ["n"]})
@@ -482,13 +479,11 @@ def test_a_message_of_millions_of_values_gives_a_bounded_view() -> None:
     assert sum(len(column) - column.count(None) for column in found.columns.values()) <= (
         2 * MAX_BATCH_VALUES + MAX_FIELDS
     )
-    assert found.messages is not None
     assert list(found.messages.raw) == [one] * 400
 
 
 def forced(batch: Batch) -> bytes:
     """The batch as an encoder without the limit of values writes it."""
-    assert batch.messages is not None
     dt = [0] + [1000] * (len(batch.times_us) - 1)
     deflater = zlib.compressobj(zdict=DICTIONARY)
     body = json.dumps({"dt": dt, "fields": {}}).encode() + b"\n" + pack(batch.messages)
