@@ -9,14 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from iort_analysis.statistics.distributions import sides, tail
-from iort_analysis.statistics.signals import Array
+from iort_analysis.statistics.signals import MAD_TO_SIGMA, Array
 from iort_contract.messages.analysis import Estimate
 
 # How many drives the catalogue's word on a healthy car's spread is worth.
 _PRIOR_DRIVES = 4
 # A drive further out than this many standard deviations counts as being there.
 _CLIPPED = 3.0
-_MAD = 1.4826
 
 
 class Baseline(NamedTuple):
@@ -61,7 +60,7 @@ def baseline(estimates: Sequence[Estimate], expected_spread: float) -> Baseline:
     errors = np.array([max(e.high - e.low, 0.0) / 2 / sides() for e in estimates])
     errors = np.maximum(errors, max(1e-3 * expected_spread, 1e-12))
     middle = float(np.median(values))
-    scale = max(_MAD * float(np.median(np.abs(values - middle))), expected_spread)
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(values - middle))), expected_spread)
     reach = _CLIPPED * np.hypot(scale, errors)
     values = np.clip(values, middle - reach, middle + reach)
     among = len(values) - 1

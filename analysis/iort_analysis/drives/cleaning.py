@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from iort_analysis.drives.drive import FROZEN, GAP, OUTLIER, SAME_TIME, SENSOR_FAULT, Repair, is_vesc
 from iort_analysis.samples.blocks import Block, Column
+from iort_analysis.statistics.signals import MAD_TO_SIGMA
 from iort_contract.catalog.vesc import ABSENT_FROM, MEASURED, VESC_FIELDS
 
 Moving = Callable[[NDArray[np.int64]], NDArray[np.bool_]]
@@ -31,7 +32,6 @@ _ACCURACY = re.compile(
 _RESETS = 0.01
 # Hampel: this many scaled median absolute deviations from the median of this many samples on either side.
 _HAMPEL, _HALF = 8.0, 7
-_MAD_TO_SIGMA = 1.4826
 # An outlier is also further away than this share of the range in which the field nearly always is, and than
 # this many times the distance that all but this share of its values keep.
 _LEAST_SHARE, _TIMES, _USUAL = 0.15, 4.0, 0.98
@@ -166,7 +166,7 @@ class _Cleaning:
         places = np.clip(candidates[:, None] + np.arange(-_HALF, _HALF + 1), 0, len(column) - 1)
         around = column[places]
         middle = np.median(around, axis=1)
-        spread = _MAD_TO_SIGMA * np.median(np.abs(around - middle[:, None]), axis=1)
+        spread = MAD_TO_SIGMA * np.median(np.abs(around - middle[:, None]), axis=1)
         # Where the neighbours themselves spread, nothing is far from them; near NaN nothing is known.
         with np.errstate(invalid="ignore"):
             far = np.abs(column[candidates] - middle) > np.maximum(_HAMPEL * spread, least)

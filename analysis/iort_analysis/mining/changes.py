@@ -22,7 +22,7 @@ from iort_analysis.mining.relations import (
 from iort_analysis.results import Event, Mined, attempt
 from iort_analysis.statistics.distributions import sides
 from iort_analysis.statistics.fitting import fit
-from iort_analysis.statistics.signals import Array, binned, bridged, runs, smooth_basis
+from iort_analysis.statistics.signals import MAD_TO_SIGMA, Array, binned, bridged, runs, smooth_basis
 from iort_contract.messages.analysis import Estimate
 
 _LEAST = 30
@@ -143,7 +143,6 @@ _DROPOUT_STEP_S = 0.1
 _PIECE_S, _MOST_PIECES = 120.0, 8
 # A dropout is so far below the model, in volts and in deviations, for at least so many steps.
 _LEAST_V, _SIGMAS, _LEAST_STEPS = 0.3, 10.0, 4
-_MAD = 1.4826
 _SHOWN_US = 3_000_000
 Steps = NDArray[np.int64]
 
@@ -160,7 +159,7 @@ def mine_dropouts(drive: Drive, samples: Readings) -> Mined:
     if fitted is None:
         return Mined(missing={KIND: "the battery's load must change"})
     off = fitted.residuals
-    sigma = _MAD * float(np.nanmedian(np.abs(off)))
+    sigma = MAD_TO_SIGMA * float(np.nanmedian(np.abs(off)))
     depths, starts, ends = _falls(off, max(_LEAST_V, _SIGMAS * sigma))
     if not len(depths):
         return Mined()

@@ -15,15 +15,13 @@ from iort_analysis import NoResultError
 from iort_analysis.drives.cleaning import pause_us
 from iort_analysis.drives.drive import Drive
 from iort_analysis.samples.positions import accuracy_m, fixes, local_metres, position_fields
-from iort_analysis.statistics.signals import Array
+from iort_analysis.statistics.signals import MAD_TO_SIGMA, Array
 
 _LEAST_POSITIONS = 30
 # Positions closer together than this many times their noise would add the noise to the distance.
 _APART_NOISES = 20
 # The differences of four positions in a row, whose variance is 20 times a position's.
 _THIRD_DIFFERENCE = math.sqrt(20)
-# A median of absolute values, as a standard deviation.
-_MAD = 1.4826
 # A receiver that is less sure of its position than this does not tell on which side of a street the car is.
 _WORST_M = 10.0
 # An area this many times as large as the positions' errors is one in which the car moved.
@@ -166,7 +164,7 @@ def _plausible(x: Array, y: Array, reach_m: Array, slack_m: float) -> NDArray[np
 
 def _noise(values: Array) -> float:
     """The noise of positions that are sampled faster than the car changes its acceleration."""
-    return float(np.median(np.abs(np.diff(values, 3)))) * _MAD / _THIRD_DIFFERENCE
+    return float(np.median(np.abs(np.diff(values, 3)))) * MAD_TO_SIGMA / _THIRD_DIFFERENCE
 
 
 def _apart(x: Array, y: Array, least_m: float) -> NDArray[np.intp]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.statistics.distributions import between, quantile, sides
-from iort_analysis.statistics.signals import Array, quantum
+from iort_analysis.statistics.signals import MAD_TO_SIGMA, Array, quantum
 from iort_contract.messages.analysis import Estimate
 
 BLOCKS = 20
@@ -193,7 +193,7 @@ class _Problem(NamedTuple):
                 return None
             coefficients = np.linalg.solve(total, weighted @ self.y + self.precision @ self.mean)
             residuals = self.y - coefficients @ self.columns
-            sigma = max(1.4826 * _median(np.abs(residuals)), 1e-9, self.resolution / 5)
+            sigma = max(MAD_TO_SIGMA * _median(np.abs(residuals)), 1e-9, self.resolution / 5)
             weights = _biweight(residuals / sigma)
         score = weights * residuals / sigma**2
         # How fast the scores change with the coefficients: less than the weights, since those change too.

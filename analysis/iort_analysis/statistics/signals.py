@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+# The median of normal errors' absolute values, times this, is their standard deviation.
+MAD_TO_SIGMA = 1.4826
 
 _FADES = 8
 # Decimal places that a sensor's values may have, and how many values show at once that they have more.

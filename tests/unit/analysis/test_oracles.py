@@ -27,7 +27,7 @@ from iort_analysis.statistics.distributions import between, mean_of, quantile, s
 from iort_analysis.statistics.fitting import Fit, Prior, fit
 from iort_analysis.statistics.signals import lagged, smooth_basis
 from iort_contract.messages.analysis import Estimate
-from tests.unit.analysis.drives import driven
+from tests.unit.analysis.simulated import driven
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -15,7 +15,7 @@ from iort_analysis.mining.laps import Laps, compare, find_laps
 from iort_analysis.mining.paths import path_of
 from iort_analysis.results import attempt
 from iort_analysis.samples.blocks import Block
-from tests.unit.analysis.drives import START_US, Driven, crossed_s, driven, sampled
+from tests.unit.analysis.simulated import START_US, Driven, crossed_s, driven, sampled
 
 _EARTH_M = 6_371_008.8
 
@@ -130,11 +130,15 @@ def wandering(seed: int) -> Driven:
     x, y = (np.cumsum(speed * each(heading)) / 50 for each in (np.cos, np.sin))
     # The walls of the hall reflect it.
     x, y = (20 * np.abs(v / 20 % 2 - 1) for v in (x, y))
-    vesc = [
-        {"speed": v * 4614, "current_motor": 3 * v, "voltage_input": 12.0, "current_input": v} for v in speed
-    ]
-    poses = [{"x": a, "y": b} for a, b in zip(x[::2], y[::2], strict=True)]
-    return Driven(sampled(vesc, poses, START_US + 20_000 * np.arange(n)), np.arange(n) / 50, x, y)
+    times_us = START_US + 20_000 * np.arange(n)
+    vesc = {
+        "speed": 4614 * speed,
+        "current_motor": 3 * speed,
+        "voltage_input": np.full(n, 12.0),
+        "current_input": speed,
+    }
+    streams = {"vesc": Block(times_us, vesc), "pose": Block(times_us[::2], {"x": x[::2], "y": y[::2]})}
+    return Driven(sampled(streams), np.arange(n) / 50, x, y)
 
 
 @pytest.mark.parametrize("seed", range(5))

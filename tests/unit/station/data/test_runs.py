@@ -21,7 +21,7 @@ from iort_station.data.runs import runs
 from iort_station.errors import StationError
 from iort_station.page.answers import answers
 from testkit.dynamodb import TELEMETRY, item_of
-from tests.unit.analysis.drives import driven
+from tests.unit.analysis.simulated import driven
 from tests.unit.station.data.test_queries import START, FakeCloud, cloud_of
 
 SECOND = 1_000_000
