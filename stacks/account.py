@@ -65,7 +65,7 @@ class Account(PlatformStack):
             self._log(settings.iot_log_level)
 
     def _audit(self) -> None:
-        role = parts.iot_role(self, "AuditRole")
+        role = parts.service_role(self, "AuditRole")
         role.add_to_policy(iam.PolicyStatement(actions=[*AUDIT_READS], resources=["*"]))
         on = iot.CfnAccountAuditConfiguration.AuditCheckConfigurationProperty(enabled=True)
         audit = iot.CfnAccountAuditConfiguration(
@@ -87,7 +87,7 @@ class Account(PlatformStack):
         daily.node.add_dependency(audit)
 
     def _log(self, level: str) -> None:
-        role = parts.iot_role(self, "LogRole")
+        role = parts.service_role(self, "LogRole")
         streams = self.format_arn(
             service="logs",
             resource="log-group",

@@ -24,7 +24,7 @@ from iort_contract.catalog.environments import (
     PresentEnvironment,
 )
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX
-from stacks.parts import PlatformStack, allow, arrays, function
+from stacks.parts import PlatformStack, allow, arrays, function, service_role
 from stacks.settings import Settings
 from stacks.states import LONGEST_S, states
 from stacks.storage import Storage
@@ -116,7 +116,7 @@ class Analysis(PlatformStack):
         return str(self._storage.files.arn_for_objects(f"{prefix}*"))
 
     def _machine(self, functions: dict[str, lambda_.Function]) -> stepfunctions.StateMachine:
-        role = self._role("Machine", "states.amazonaws.com")
+        role = service_role(self, "MachineRole", "states.amazonaws.com")
 
         def may(actions: list[str], resources: list[str]) -> None:
             role.add_to_policy(iam.PolicyStatement(actions=actions, resources=resources))
@@ -170,7 +170,7 @@ class Analysis(PlatformStack):
         return machine
 
     def _nightly(self) -> None:
-        role = self._role("Nightly", "scheduler.amazonaws.com")
+        role = service_role(self, "NightlyRole", "scheduler.amazonaws.com")
         self.machine.grant_start_execution(role)
         scheduler.CfnSchedule(
             self,
@@ -183,8 +183,3 @@ class Analysis(PlatformStack):
                 input=json.dumps({"robots": [], "last_s": _NIGHTLY_S, "most": _MOST_DRIVES}),
             ),
         )
-
-    def _role(self, name: str, service: str) -> iam.Role:
-        # The service acts for every account; only for ours may it take our role.
-        conditions = {"StringEquals": {"aws:SourceAccount": self.account}}
-        return iam.Role(self, f"{name}Role", assumed_by=iam.ServicePrincipal(service, conditions=conditions))

@@ -276,7 +276,7 @@ class Fleet(PlatformStack):
         AWS does not document the actions that it needs. Its managed policy AWSIoTThingsRegistration has them,
         on every resource; this role has the same actions, without those that this template never uses.
         """
-        role = parts.iot_role(self, "ProvisioningRole")
+        role = parts.service_role(self, "ProvisioningRole")
 
         def allow(actions: list[str], *resources: tuple[str, str]) -> None:
             arns = [self.format_arn(service="iot", resource=r, resource_name=n) for r, n in resources]

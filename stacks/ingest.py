@@ -41,7 +41,7 @@ class Ingest(PlatformStack):
 
     def _rule(self, rule: Rule) -> None:
         name = rule.name.capitalize()
-        role = parts.iot_role(self, f"{name}Role")
+        role = parts.service_role(self, f"{name}Role")
         failures = self._queues[rule.error_queue]
         failures.grant(role, "sqs:SendMessage")
         called = None

@@ -56,6 +56,21 @@ class Encryption:
 
     def __init__(self, key: kms.Key | None = None) -> None:
         self.key = key
+        self.table: dict[str, Any] = {}
+        self.queue: dict[str, Any] = {"encryption": sqs.QueueEncryption.SQS_MANAGED}
+        self.bucket: dict[str, Any] = {"encryption": s3.BucketEncryption.S3_MANAGED}
+        self.log: dict[str, Any] = {}
+        # With SNS' own key, CloudWatch's alarms could not publish.
+        self.topic: dict[str, Any] = {}
+        if key is not None:
+            self.table = {"encryption": dynamodb.TableEncryption.CUSTOMER_MANAGED, "encryption_key": key}
+            self.queue = {"encryption": sqs.QueueEncryption.KMS, "encryption_master_key": key}
+            self.bucket = {"encryption": s3.BucketEncryption.KMS, "encryption_key": key}
+            # Without reuse, every message and object would be a request to KMS.
+            self.queue["data_key_reuse"] = Duration.hours(1)
+            self.bucket["bucket_key_enabled"] = True
+            self.log = {"encryption_key": key}
+            self.topic = {"master_key": key}
 
     @classmethod
     def of(cls, stack: Stack, settings: Settings) -> Encryption:
@@ -66,46 +81,6 @@ class Encryption:
         # The other stacks import it until they are updated, after this one.
         stack.export_value(key.key_arn)
         return cls(key if settings.customer_key else None)
-
-    @property
-    def table(self) -> dict[str, Any]:
-        """Arguments of a `dynamodb.Table`."""
-        if self.key is None:
-            return {}
-        return {"encryption": dynamodb.TableEncryption.CUSTOMER_MANAGED, "encryption_key": self.key}
-
-    @property
-    def queue(self) -> dict[str, Any]:
-        """Arguments of a `sqs.Queue`."""
-        if self.key is None:
-            return {"encryption": sqs.QueueEncryption.SQS_MANAGED}
-        # Without reuse, every message would be a request to KMS.
-        return {
-            "encryption": sqs.QueueEncryption.KMS,
-            "encryption_master_key": self.key,
-            "data_key_reuse": Duration.hours(1),
-        }
-
-    @property
-    def bucket(self) -> dict[str, Any]:
-        """Arguments of a `s3.Bucket`."""
-        if self.key is None:
-            return {"encryption": s3.BucketEncryption.S3_MANAGED}
-        return {
-            "encryption": s3.BucketEncryption.KMS,
-            "encryption_key": self.key,
-            "bucket_key_enabled": True,
-        }
-
-    @property
-    def log(self) -> dict[str, Any]:
-        """Arguments of a `logs.LogGroup`."""
-        return {} if self.key is None else {"encryption_key": self.key}
-
-    @property
-    def topic(self) -> dict[str, Any]:
-        """Arguments of a `sns.Topic`. With SNS' own key, CloudWatch's alarms could not publish."""
-        return {} if self.key is None else {"master_key": self.key}
 
 
 def _key(stack: Stack, settings: Settings) -> kms.Key:
@@ -334,13 +309,7 @@ def schedules(
 
     The CDK's own target may call every version of a function, too.
     """
-    caller = iam.Role(
-        stack,
-        "ScheduleRole",
-        assumed_by=iam.ServicePrincipal(
-            "scheduler.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": stack.account}}
-        ),
-    )
+    caller = service_role(stack, "ScheduleRole", "scheduler.amazonaws.com")
     caller.add_to_policy(
         iam.PolicyStatement(actions=["lambda:InvokeFunction"], resources=[called.function_arn])
     )
@@ -360,12 +329,13 @@ def schedules(
 _SERVICE = "iot.amazonaws.com"
 
 
-def iot_role(stack: Stack, construct_id: str) -> iam.Role:
-    """A role that AWS IoT may assume for this account's resources; it grants nothing yet."""
-    principal = iam.ServicePrincipal(
-        _SERVICE, conditions={"StringEquals": {"aws:SourceAccount": stack.account}}
-    )
-    return iam.Role(stack, construct_id, assumed_by=principal)
+def service_role(stack: Stack, construct_id: str, service: str = _SERVICE) -> iam.Role:
+    """A role that a service, AWS IoT without one, may assume; it grants nothing yet.
+
+    The service acts for every account; only for ours may it take our role.
+    """
+    conditions = {"StringEquals": {"aws:SourceAccount": stack.account}}
+    return iam.Role(stack, construct_id, assumed_by=iam.ServicePrincipal(service, conditions=conditions))
 
 
 def may_call(
