@@ -1,7 +1,7 @@
 """The telemetry and summary tables in DynamoDB: every key condition on them, and every batch write.
 
 The caller hands in a boto3 DynamoDB client. Items stay as DynamoDB sends them: ``{"n": {"N": "50"}}``.
-`plain` turns them into Python values. `quick` makes a client several times as fast with them.
+`plain` turns them into Python values. `quick` makes a client read them several times as fast.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from decimal import Decimal
 from itertools import islice
 from typing import Any, Callable, Dict, Iterable, Iterator, Mapping, NamedTuple, Sequence, TypeVar
 
-from iort_contract.checks import COMPACT, integer, shown
+from iort_contract.checks import integer, shown
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.batch import batches_between
 from iort_contract.tables import BATCH, SECOND, TOPIC
@@ -23,9 +23,6 @@ WRITE_ITEMS = 25
 _WRITE_ATTEMPTS = 8
 # The contract allows no time beyond these.
 _FIRST_S, _LAST_S = -(2**53), 2**53
-# Where a request's JSON waits in botocore's context.
-_BODY = "iort_body"
-_ANY_WRITE: Mapping[str, Any] = {"DeleteRequest": {"Key": {}}}
 _Client = TypeVar("_Client")
 
 
@@ -49,7 +46,7 @@ class Keys(NamedTuple):
 
 
 def quick(client: _Client) -> _Client:
-    """The same boto3 client; it reads pages and writes batches of items in one pass of JSON each.
+    """The same boto3 client; it reads a page in one pass of JSON.
 
     botocore looks up the shape of every value, which took a fifth of Lambda 2's processor time. Items are
     DynamoDB's JSON on both sides of it, but for bytes: with these botocore does the work. By its events
@@ -58,8 +55,6 @@ def quick(client: _Client) -> _Client:
     events = client.meta.events  # type: ignore[attr-defined]  # any client of boto3
     for operation in ("Query", "Scan"):
         events.register_first(f"before-parse.dynamodb.{operation}", _read_page, f"iort-{operation}")
-    events.register_last("provide-client-params.dynamodb.BatchWriteItem", _set_aside, "iort-set-aside")
-    events.register_first("before-call.dynamodb.BatchWriteItem", _put_back, "iort-put-back")
     return client
 
 
@@ -68,19 +63,6 @@ def _read_page(response_dict: dict[str, Any], customized_response_dict: dict[str
     if response_dict["status_code"] == 200 and b'"B"' not in body and b'"BS"' not in body:
         customized_response_dict.update(json.loads(body))
         response_dict["body"] = b"{}"
-
-
-def _set_aside(params: Mapping[str, Any], context: dict[str, Any], **_: Any) -> Mapping[str, Any]:
-    try:
-        context[_BODY] = COMPACT.encode(params).encode()
-    except TypeError:
-        return params
-    # Where the request goes may follow from the tables' names. A client that validates wants one item each.
-    return {**params, "RequestItems": {table: [_ANY_WRITE] for table in params["RequestItems"]}}
-
-
-def _put_back(params: dict[str, Any], context: Mapping[str, Any], **_: Any) -> None:
-    params["body"] = context.get(_BODY, params["body"])
 
 
 def starting_between(first_us: int | None, last_us: int | None) -> Keys:

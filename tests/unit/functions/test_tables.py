@@ -7,7 +7,6 @@ from decimal import Decimal
 
 import boto3
 import pytest
-from botocore.config import Config
 from botocore.exceptions import ClientError, EndpointConnectionError
 
 from functions.shared import tables as tables_module
@@ -50,9 +49,8 @@ def put(client, table, item):
         client.put_item(TableName=table, Item=item)
 
 
-@pytest.mark.parametrize("validates", [False, True])
-def test_a_quick_client_writes_and_reads_what_botocore_does(dynamodb, validates):
-    quickly = quick(boto3.client("dynamodb", config=Config(parameter_validation=validates)))
+def test_a_quick_client_reads_what_botocore_does(dynamodb):
+    quickly = quick(boto3.client("dynamodb"))
     calls = [quickly.query, dynamodb.query, quickly.scan, dynamodb.scan]
     for samples in (
         {"S": "\u00e4\n"},
@@ -61,12 +59,10 @@ def test_a_quick_client_writes_and_reads_what_botocore_does(dynamodb, validates)
         {"B": b"\xff"},
     ):
         item = {TOPIC: {"S": "t"}, BATCH: {"S": str(samples)}, "samples": samples}
-        quickly.batch_write_item(RequestItems={TELEMETRY: [{"PutRequest": {"Item": item}}]})
-        key = {name: item[name] for name in (TOPIC, BATCH)}
-        assert dynamodb.get_item(TableName=TELEMETRY, Key=key)["Item"] == item
+        dynamodb.put_item(TableName=TELEMETRY, Item=item)
         condition = {
             "ExpressionAttributeNames": {"#t": TOPIC},
-            "ExpressionAttributeValues": {":t": key[TOPIC]},
+            "ExpressionAttributeValues": {":t": item[TOPIC]},
         }
         query, scan = ({name: "#t = :t"} for name in ("KeyConditionExpression", "FilterExpression"))
         pages = [
