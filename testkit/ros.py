@@ -55,20 +55,26 @@ class RosGraph:
         self._python, self._folder = python, folder
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
-            self._port = int(probe.getsockname()[1])
+            port = int(probe.getsockname()[1])
         self.environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith("ROS_")},
-            "ROS_MASTER_URI": f"http://127.0.0.1:{self._port}",
+            "ROS_MASTER_URI": f"http://127.0.0.1:{port}",
             "ROS_IP": "127.0.0.1",
             "ROS_LOG_DIR": str(folder),
             "ROS_HOME": str(folder),
             "PYTHONPATH": PYTHONPATH,
             "PYTHONUNBUFFERED": "1",
         }
+        self.master = [SYSTEM_PYTHON, str(shutil.which("rosmaster")), "--core", "-p", str(port)]
         self._processes: list[subprocess.Popen[str]] = []
 
     def __enter__(self) -> Self:
-        self.run([SYSTEM_PYTHON, str(shutil.which("rosmaster")), "--core", "-p", str(self._port)])
+        self.run(self.master)
+        self.await_master()
+        return self
+
+    def await_master(self) -> None:
+        """Wait until the master answers. Raises `RosError`."""
         deadline = time.monotonic() + _START_S
         while True:
             try:
@@ -80,7 +86,7 @@ class RosGraph:
                 # The master does not report when it is ready.
                 time.sleep(0.05)
             else:
-                return self
+                return
 
     def __exit__(self, *_: object) -> None:
         for process in reversed(self._processes):

@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import threading
-import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,8 +19,7 @@ from typing import Any
 import pytest
 
 from testkit import ROOT
-from testkit.ports import free_port
-from testkit.ros import PYTHONPATH, SYSTEM_PYTHON, python_with_rospy
+from testkit.ros import SYSTEM_PYTHON, RosGraph, python_with_rospy
 
 SCRIPTS = Path(__file__).resolve().parent / "nodes"
 PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs"
@@ -154,34 +152,14 @@ class Graph:
 
     def __init__(self, python: str, folder: Path) -> None:
         self.python, self.folder = python, folder
-        self.port = free_port()
-        self.environment = {
-            **{name: value for name, value in os.environ.items() if not name.startswith("ROS_")},
-            "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
-            "ROS_IP": "127.0.0.1",
-            "ROS_LOG_DIR": str(folder),
-            "ROS_HOME": str(folder),
-            "PYTHONPATH": PYTHONPATH,
-            "PYTHONUNBUFFERED": "1",
-        }
+        self._ros = RosGraph(python, folder)
+        self.environment = self._ros.environment
         self.master: Process
         self._processes: list[Process] = []
 
     def start_master(self) -> None:
-        command = [SYSTEM_PYTHON, str(shutil.which("rosmaster")), "--core", "-p", str(self.port)]
-        self.master = self.start(command)
-        deadline = time.monotonic() + WAIT_S
-        while not self._answers():
-            assert time.monotonic() < deadline, "\n".join(self.master.errors)
-            time.sleep(0.05)  # a process gives no notice when it is ready
-
-    def _answers(self) -> bool:
-        try:
-            with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"]) as proxy:
-                proxy.getPid("/test")
-        except OSError:
-            return False
-        return True
+        self.master = self.start(self._ros.master)
+        self._ros.await_master()
 
     def run(self, script: str, *arguments: object) -> Process:
         return self.start([self.python, str(SCRIPTS / script), *map(str, arguments)])
