@@ -68,8 +68,7 @@ def secured(config: Config, raw: socket.socket, address: str) -> ssl.SSLSocket:
     except (OSError, ValueError) as error:
         todo = "copy root-ca.pem from the robot's bundle again"
         raise BlockedError("root_ca", f"{config.root_ca} cannot be used: {error}", todo) from error
-    with suppress(IdentityError):
-        check_pair(config.certificate, config.private_key)
+    if _is_pair(config):
         context.load_cert_chain(config.certificate, config.private_key)
     if config.port == _HTTPS_PORT:
         context.set_alpn_protocols(["x-amzn-mqtt-ca"])
@@ -79,6 +78,15 @@ def secured(config: Config, raw: socket.socket, address: str) -> ssl.SSLSocket:
         raise BlockedError("server certificate", *_distrusted(config, address, error)) from error
     except (OSError, ValueError) as error:
         raise BlockedError("TLS", *no_tls(config, error)) from error
+
+
+def _is_pair(config: Config) -> bool:
+    """Whether certificate and key belong together. Where they do not, another check says so."""
+    try:
+        check_pair(config.certificate, config.private_key)
+    except IdentityError:
+        return False
+    return True
 
 
 def _distrusted(config: Config, address: str, error: ssl.SSLCertVerificationError) -> tuple[str, str]:
@@ -181,7 +189,7 @@ def check_connection(config: Config, running: Status | None = None) -> Iterator[
             else:
                 why = running.connection.last_error
                 yield Finding("broker", FAIL, f"the running agent is not connected: {why}")
-        if running is None:
+        if running is None and _is_pair(config):
             offset = yield from _broker(config)
     except BlockedError as blocked:
         yield blocked.finding
