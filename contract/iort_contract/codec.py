@@ -130,58 +130,35 @@ def _decimals(value: float) -> int:
     return max(0, len(mantissa.partition(".")[2]) - int(exponent or 0))
 
 
-def decimals_of(name: str, column: Any, n: int) -> int | None:
-    """Check the form of a written column of ``n`` values; its decimals, or None for plain values.
-
-    Every reader of columns calls this before it decodes the values, and `check_sums` after.
-    """
-    if not isinstance(column, list) or len(column) != n + 1:
-        raise ContractError(f"field {name} must have {n} values")
-    decimals = column[0]
-    if decimals is None:
-        return None
-    if type(decimals) is not int or not 0 <= decimals < len(SCALES):
-        raise ContractError(f"field {name}: decimals must be 0 to {len(SCALES) - 1}, got {shown(decimals)}")
-    # Check the first step before adding: sums of texts and lists take quadratic time.
-    if type(column[1]) is not int:
-        raise not_integers(name)
-    return decimals
-
-
-def check_sums(name: str, lowest: int, highest: int) -> None:
-    """Refuse a column whose summed steps lie beyond 53 bits."""
-    if highest >= EXACT or lowest <= -EXACT:
-        raise ContractError(f"field {name}: values must fit in 53 bits")
-
-
-def not_integers(name: str) -> ContractError:
-    """The error for a column with a step that is no integer."""
-    return ContractError(f"field {name}: the steps must be integers")
-
-
-def plain_values(name: str, column: Sequence[Any]) -> list[Value]:
-    """The values of a column without decimals, if a batch may hold them."""
-    values, nulled = wire_column(name, column[1:])
-    if nulled:
-        raise ContractError(f"field {name}: numbers must be finite")
-    return values
+_NOT_INTEGERS = "the steps must be integers"
 
 
 def unpacked(name: str, column: Any, n: int) -> list[Value]:
     """Decode ``n`` values of a column; raises `ContractError` if `packed` cannot have written it."""
-    decimals = decimals_of(name, column, n)
+    if not isinstance(column, list) or len(column) != n + 1:
+        raise ContractError(f"field {name} must have {n} values")
+    decimals = column[0]
     if decimals is None:
-        return plain_values(name, column)
+        values, nulled = wire_column(name, column[1:])
+        if nulled:
+            raise ContractError(f"field {name}: numbers must be finite")
+        return values
+    if type(decimals) is not int or not 0 <= decimals < len(SCALES):
+        raise ContractError(f"field {name}: decimals must be 0 to {len(SCALES) - 1}, got {shown(decimals)}")
+    # Check the first step before adding: sums of texts and lists take quadratic time.
+    if type(column[1]) is not int:
+        raise ContractError(f"field {name}: {_NOT_INTEGERS}")
     try:
         whole = list(accumulate(column[1:]))
     except (TypeError, OverflowError) as error:
-        raise not_integers(name) from error
+        raise ContractError(f"field {name}: {_NOT_INTEGERS}") from error
     # An integer sum means integer steps, or booleans, which count as 1 and 0.
     if type(whole[-1]) is not int:
-        raise not_integers(name)
+        raise ContractError(f"field {name}: {_NOT_INTEGERS}")
     # Sorting finds both ends in half the time of min and max.
     ordered = sorted(whole)
-    check_sums(name, ordered[0], ordered[-1])
+    if ordered[-1] >= EXACT or ordered[0] <= -EXACT:
+        raise ContractError(f"field {name}: values must fit in 53 bits")
     if not decimals:
         return cast("list[Value]", whole)
     scale = SCALES[decimals]
