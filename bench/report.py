@@ -119,8 +119,8 @@ ANALYSIS = Report("analysis", "The proof of the analysis", "make bench ONLY=anal
 
 def draw(sections: Sequence[Section], path: Path) -> None:
     """Draw every figure beside its target, which is the line at 1, as a picture."""
-    import matplotlib as mpl  # noqa: PLC0415 - `make bench --help` and the guard draw nothing
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    import matplotlib as mpl  # noqa: PLC0415 - the help and the guard draw nothing
+    from matplotlib.figure import Figure  # noqa: PLC0415 - as above
 
     ratios = [(part, entry) for section in sections for entry in section.ratios if (part := entry.of_target)]
     with mpl.rc_context({"svg.hashsalt": "iort", "svg.fonttype": "none", "font.size": 9}):
