@@ -89,7 +89,7 @@ def compare(recorded: Bag, exported: Bag) -> list[Difference]:
     for topic, kind in recorded.kinds.items():
         sent, came = recorded.of(topic), exported.of(topic)
         missing = _beyond(sent, Counter(one.data for one in came))
-        extra = _beyond(came[::-1], Counter(one.data for one in sent))[::-1]
+        extra = _beyond(came, Counter(one.data for one in sent))
         if missing or extra:
             found.append(Difference(topic, len(sent), missing, extra, _words(kind, missing, extra)))
         elif came and kind[:2] != exported.kinds[topic][:2]:
