@@ -18,9 +18,9 @@ from iort_contract.catalog.streams import AGENT_STREAM, LOG_STREAM, OWN_STREAMS
 
 _log = logging.getLogger(__name__)
 
-# The longest delay of a silent stream's last live sample and last batch. What can wait is looked at once a
-# second: each part that is woken from a cold cache costs as much as ten samples.
-_TICK_S, _SLOW_S = 0.5, 1.0
+# The longest delay of a silent stream's last live sample, and the shortest wait for its last batch. What can
+# wait is looked at once a second: each part that is woken from a cold cache costs as much as ten samples.
+_TICK_S, _LEAST_S, _SLOW_S = 0.5, 0.1, 1.0
 _TYPES_S = 3600.0
 _CLOSE_S = 5.0
 # A warm Lambda function answers well within this time.
@@ -112,12 +112,13 @@ class Runtime:
         failed = self._broken or any(source.failed for source in agent.sources)
         return 0 if delivered and not failed else 1
 
-    def tick(self) -> None:
-        """Do what is due of what cannot wait; `run` calls it several times a second."""
-        self.agent.streams.tick()
+    def tick(self) -> float:
+        """Do what is due of what cannot wait; when a silent stream's batch is to be closed."""
+        closes_at = self.agent.streams.tick()
         self.agent.record.tick()
         self.agent.live.tick()
         self.agent.shadow.tick()
+        return closes_at
 
     def tick_slowly(self) -> None:
         """Do what else is due; `run` calls it once a second."""
@@ -139,10 +140,12 @@ class Runtime:
         clock = self.agent.clock
         slow_at = self._measured = self._repeated = clock.monotonic()
         self.agent.accounts.tell()
-        while not clock.wait(self._stop, _TICK_S):
-            self.tick()
-            if clock.monotonic() >= slow_at:
-                slow_at = clock.monotonic() + _SLOW_S - _TICK_S / 2
+        wait_s = _TICK_S
+        while not clock.wait(self._stop, wait_s):
+            closes_at, now = self.tick(), clock.monotonic()
+            wait_s = min(_TICK_S, max(_LEAST_S, closes_at - now))
+            if now >= slow_at:
+                slow_at = now + _SLOW_S - _TICK_S / 2
                 self.tick_slowly()
 
     def _send_log(self) -> None:

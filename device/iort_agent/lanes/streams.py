@@ -103,11 +103,14 @@ class BatchEncoder:
         with self._lock:
             return StreamCounts(*vars(self._counts).values())
 
-    def tick(self) -> None:
-        """Close the batches of a topic that has fallen silent."""
+    def tick(self) -> float:
+        """Close the batches of a topic that has fallen silent; when the next one is due."""
+        age_s = self._batch_s + _GRACE_S
         with self._lock:
-            if self._open:
-                self._close_older(self._clock.monotonic(), self._batch_s + _GRACE_S)
+            if not self._open:
+                return math.inf
+            self._close_older(self._clock.monotonic(), age_s)
+            return min((batch.opened for batch in self._open.values()), default=math.inf) + age_s
 
     def flush(self) -> None:
         """Close every batch, whatever it holds."""
@@ -258,10 +261,9 @@ class Streams:
         if resumes:
             self.repeat_types()
 
-    def tick(self) -> None:
-        """Close the batches of silent streams; called several times a second."""
-        for encoder in list(self._encoders.values()):
-            encoder.tick()
+    def tick(self) -> float:
+        """Close the batches of silent streams; when the next one is due."""
+        return min([encoder.tick() for encoder in list(self._encoders.values())], default=math.inf)
 
     def flush(self) -> None:
         """Close every batch."""

@@ -10,7 +10,7 @@ import logging
 import threading
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Mapping, NamedTuple, Optional
+from typing import Any, Callable, Mapping, NamedTuple, Optional
 
 from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.schema import choice, items, setting, text
@@ -146,8 +146,9 @@ class Intake:
         """Count and log something about the topic's messages."""
         self.throttled.warn(reason, f"topic {self._topic}: {why}")
 
-    def look(self, connections: int) -> None:
-        """Log when the topic falls silent, and when it is heard again."""
+    def look(self, connections: Callable[[], int]) -> None:
+        """Take what waits, and log when the topic falls silent, and when it is heard again; several times a
+        second."""
         now = self._clock.monotonic()
         if now >= self._due:
             self.take_received()
@@ -158,7 +159,8 @@ class Intake:
             self._silent = False
         elif not self._silent and now - self._heard >= _SILENT_S:
             self._silent = True
-            there = f"connected to {connections} publisher(s)" if connections else "nobody publishes it"
+            count = connections()
+            there = f"connected to {count} publisher(s)" if count else "nobody publishes it"
             _log.warning("topic %s has been silent for %g s: %s", self._topic, _SILENT_S, there)
 
     def report(self) -> dict[str, Any]:

@@ -5,6 +5,7 @@ The publisher sends its message's definition when it connects. ROS_MASTER_URI na
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import re
 import threading
@@ -21,7 +22,7 @@ from iort_agent.sources.intake import Intake
 from iort_contract.limits import ContractError
 
 # The longest delay of the last message of a topic that falls silent.
-_LOOK_S = 0.5
+_LOOK_S = 0.3
 _TOPIC = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
 _NODE = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
@@ -118,7 +119,7 @@ class Ros1Source:
                 for topic, intake in self._intakes.items():
                     intake.sim_time = node.sim_time
                     if node.ready.is_set():
-                        intake.look(node.connections(topic))
+                        intake.look(functools.partial(node.connections, topic))
         finally:
             for topic, intake in self._intakes.items():
                 node.unsubscribe(topic, intake.receive)

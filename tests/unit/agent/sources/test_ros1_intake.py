@@ -67,10 +67,10 @@ def test_the_last_message_of_a_silent_topic_waits_for_the_next_look() -> None:
     desk.next_at = desk.clock.monotonic() + 0.1
     desk.intake.receive(CONNECTION, b"\x00")
     desk.intake.receive(CONNECTION, b"\x01")
-    desk.intake.look(1)
+    desk.intake.look(lambda: 1)
     assert len(desk.samples) == 1
     desk.clock.advance(0.5)
-    desk.intake.look(1)
+    desk.intake.look(lambda: 1)
     assert len(desk.samples) == 2
 
 
@@ -185,18 +185,18 @@ def test_a_latched_message_that_comes_again_is_no_new_data(time: str) -> None:
     old, new = (header(T0 // 1_000_000 + second) + b"\x01" for second in (0, 1))
     first, second = ({**CONNECTION, "latching": "1", "callerid": "/map"} for _ in range(2))
     desk.intake.take(first, old)
-    desk.intake.look(1)
+    desk.intake.look(lambda: 1)
     desk.clock.advance(6)
-    desk.intake.look(1)
+    desk.intake.look(lambda: 1)
     desk.intake.take(second, old)
-    desk.intake.look(1)
+    desk.intake.look(lambda: 1)
     assert len(desk.samples) == 1
     assert desk.intake.report() == {"messages": 1, "silent": True, "left_out": {}, "latched_again": 1}
     # The same twice by one connection was published twice; another publisher's is its own.
     desk.intake.take(second, old)
     desk.intake.take({**first, "callerid": "/other"}, old)
     desk.intake.take({**first}, new)
-    desk.intake.look(1)
+    desk.intake.look(lambda: 1)
     assert len(desk.samples) == 4
     assert desk.intake.report() == {"messages": 4, "silent": False, "left_out": {}, "latched_again": 1}
 
@@ -298,11 +298,11 @@ def test_silence_is_told_once_and_its_end_too(caplog: pytest.LogCaptureFixture) 
     desk = Desk(time="arrival")
     for _ in range(12):
         desk.clock.advance(1)
-        desk.intake.look(0)
+        desk.intake.look(lambda: 0)
     assert caplog.text.count("topic /t has been silent for 5 s: nobody publishes it") == 1
     assert desk.intake.report()["silent"]
     desk.take(b"\x01", message_definition="uint8 u")
-    desk.intake.look(1)
+    desk.intake.look(lambda: 1)
     assert "is heard again" in caplog.text
     assert desk.intake.report()["silent"] is False
 
