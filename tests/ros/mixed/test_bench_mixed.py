@@ -27,4 +27,4 @@ def test_both_recorders_record_the_mixed_robot(ros_python: str) -> None:
     for name in ("/sensors/core", "/odom", "/diagnostics"):
         assert found.arrived[name] == found.published[name]
     assert 0 < found.bag_bz2_bytes < found.bag_bytes
-    assert all(cpu_s > 0 for cpu_s in found.cpu_s.values())
+    assert all(usage.cpu_s > 0 for usage in found.used.values())
