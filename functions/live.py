@@ -137,8 +137,8 @@ def _robot(event: Any) -> str:
 @cache
 def lane() -> Lane:
     """The lane of this environment."""
-    given = variables(LiveEnvironment)
-    return Lane(given.live_fields, StoredPublisher(given.pubnub_parameter).publish)
+    environment = variables(LiveEnvironment)
+    return Lane(environment.live_fields, StoredPublisher(environment.pubnub_parameter).publish)
 
 
 @quarantined

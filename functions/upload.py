@@ -215,9 +215,9 @@ def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
         yield row[0], row[-1]
 
 
-def _reply(topic: Topic, found: FileAnswer) -> None:
+def _reply(topic: Topic, state: FileAnswer) -> None:
     answers = build_topic(PONG, topic.robot, FILE, topic.namespace)
-    clients.iot_data().publish(topic=answers, qos=1, payload=encode_file_answer(found))
+    clients.iot_data().publish(topic=answers, qos=1, payload=encode_file_answer(state))
 
 
 @quarantined
@@ -226,7 +226,7 @@ def handler(event: Mapping[str, Any]) -> None:
 
     A malformed request is refused; without an id it cannot be answered, and goes to the quarantine.
     """
-    given, topic = variables(UploadEnvironment), parse_topic(event[TOPIC])
+    environment, topic = variables(UploadEnvironment), parse_topic(event[TOPIC])
     envelope: dict[str, Any] = {}
     try:
         envelope = json_object(event_message(event), "file request")
@@ -239,21 +239,21 @@ def handler(event: Mapping[str, Any]) -> None:
         _log.warning("refused a request of %s: %s", topic.robot, error)
         _reply(topic, FileAnswer(request_id, refused=str(error)))
         return
-    bucket = Bucket(clients.s3(), given.files_bucket, clients.s3_for_robots())
+    bucket = Bucket(clients.s3(), environment.files_bucket, clients.s3_for_robots())
     quota = Quota(
         clients.dynamodb(),
-        table=given.robots_table,
+        table=environment.robots_table,
         named=(FILES_DAY, FILES_BYTES),
         period=DAY,
-        most=given.upload_bytes_a_day,
+        most=environment.upload_bytes_a_day,
     )
-    found = answer(topic.robot, request, bucket, quota, time.time())
-    done = found.stored and request.parts_sha256 is not None
+    state = answer(topic.robot, request, bucket, quota, time.time())
+    done = state.stored and request.parts_sha256 is not None
     emit(
         "upload",
         FilesAsked=1,
-        FilesRefused=int(found.refused is not None),
+        FilesRefused=int(state.refused is not None),
         FilesStored=int(done),
         StoredBytes=request.file.size if done else 0,
     )
-    _reply(topic, found)
+    _reply(topic, state)
