@@ -68,13 +68,14 @@ class EmbeddedCloud:
     cannot start. An error within the block is an `EmulatorError` if the emulator has ended.
     """
 
+    host = "127.0.0.1"
+
     def __init__(
         self,
         folder: Path = FOLDER,
         *,
         namespace: str = DEFAULT_NAMESPACE,
         live: str = PUBNUB,
-        host: str = "127.0.0.1",
         ports: dict[str, int] | None = None,
         progress: Progress = lambda _step: None,
         kept: bool = False,
@@ -84,7 +85,7 @@ class EmbeddedCloud:
         journal: bool = False,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self.folder, self.namespace, self.host = folder, namespace, host
+        self.folder, self.namespace = folder, namespace
         self.live, self.kept, self.listen = live, kept, listen
         self.state = StateFolder(folder, kept=kept, any_ports=any_ports)
         self.ports = ports or {}

@@ -12,8 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-# The errors that the embedded cloud raises on purpose.
-
 
 class LocalError(Exception):
     """The embedded cloud cannot do what was asked. The text says why and what to do."""

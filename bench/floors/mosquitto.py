@@ -63,7 +63,7 @@ class Mosquitto:
         return self._folder / "ca.pem"
 
     def __enter__(self) -> Self:
-        self._authority.write_own(self.ca)
+        self.ca.write_text(self._authority.pem)
         self.identity("broker")
         config = self._folder / "mosquitto.conf"
         config.write_text(_SETTINGS.format(port=self.port, host=HOST, folder=self._folder))

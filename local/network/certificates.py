@@ -65,10 +65,6 @@ class Authority:
         end = None if lasts_s is None else datetime.now(timezone.utc) + timedelta(seconds=lasts_s)
         return self._authority.issue_cert(*hosts, common_name=name, not_after=end)
 
-    def write_own(self, path: Path) -> None:
-        """Write the authority's own certificate."""
-        self._authority.cert_pem.write_to_path(path)
-
     def signed(self, certificate: x509.Certificate) -> bool:
         """Whether this authority has signed a certificate."""
         own = x509.load_pem_x509_certificate(self.pem.encode())

@@ -83,7 +83,7 @@ REFUSED, NO_GATEWAY = 403, 502
 
 @pytest.fixture
 def relay(tmp_path):
-    Authority().write_own(tmp_path / "ca.pem")
+    (tmp_path / "ca.pem").write_text(Authority().pem)
     # Nothing listens on port 9.
     with Relay("127.0.0.1", 0, gateway="https://127.0.0.1:9", authority=str(tmp_path / "ca.pem")) as relay:
         yield relay

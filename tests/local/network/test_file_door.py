@@ -209,7 +209,7 @@ def test_a_connection_that_never_asks_is_closed(tmp_path, monkeypatch):
     authority = Authority()
     certificate = ServerCertificate(authority, tmp_path / "files.pem", (HOST,))
     certificate.renew()
-    authority.write_own(tmp_path / "ca.pem")
+    (tmp_path / "ca.pem").write_text(authority.pem)
     trusts = ssl.create_default_context(cafile=tmp_path / "ca.pem")
     given = {"gateway": "https://127.0.0.1:9", "bucket": "files", "certificate": certificate}
     with (
@@ -228,7 +228,7 @@ def test_the_door_takes_over_a_renewed_certificate(tmp_path):
     certificate = ServerCertificate(authority, tmp_path / "files.pem", (HOST,))
     certificate.renew()
     given = {"gateway": "https://127.0.0.1:9", "bucket": "files", "certificate": certificate}
-    authority.write_own(tmp_path / "ca.pem")
+    (tmp_path / "ca.pem").write_text(authority.pem)
     with FileDoor(HOST, 0, authority=tmp_path / "ca.pem", **given) as door:
         shown = [ssl.get_server_certificate((HOST, door.port)).strip()]
         certificate.path.unlink()
