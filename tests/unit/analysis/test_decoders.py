@@ -48,7 +48,8 @@ BATCHES = [
     batch.Batch(RUN, 5, TIMES, {"note": ["a", "b", None]}, 0, Messages(NAMES.id, NAMES.layout, TEXTS)),
 ]
 ITEMS = list(map(item_of, BATCHES))
-COLUMNS, ABOUT = as_columns(BATCHES[2].messages, TIMES)
+PACKED, ABOUT = as_columns(BATCHES[2].messages, TIMES)
+COLUMNS = {name: unpacked(name, column, len(TIMES)) for name, column in PACKED.items()}
 DRIVE, ESTIMATE = analysis.DriveKey("car7", T_US, RUN), analysis.Estimate(0.03, 0.02, 0.04, "ohm")
 FINDING = analysis.Finding(
     DRIVE, "battery_worn", "warning", "a", 1, 2, "vesc", ("volts",), "worn", ESTIMATE, ESTIMATE, 0.1
