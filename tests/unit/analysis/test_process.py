@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 import statsmodels.api as sm
@@ -75,23 +74,6 @@ def test_a_drive_in_any_state_has_a_result() -> None:
         assert {key for key in result.mined.missing if "." in key or key in {"samples", "vesc"}} == missing, (
             name
         )
-
-
-def test_an_hour_takes_seconds() -> None:
-    """180,000 samples of the controller; the cleaning and the miner that reads the most."""
-    hour = {
-        name: Block(
-            np.concatenate([block.times_us + i * 600_000_000 for i in range(6)]),
-            {field: np.tile(column, 6) for field, column in block.columns.items()},
-        )
-        for name, block in streams(600).items()
-    }
-    before = time.process_time()
-    result = analyse(KEY, hour, VEHICLE, miners={"anomalies": MINERS["anomalies"]})
-    took_s = time.process_time() - before
-
-    assert result.samples == 270_000
-    assert took_s < 2
 
 
 def test_wild_values_are_repaired_and_named_where_they_are_too_many() -> None:
