@@ -190,7 +190,7 @@ def answer(robot: str, request: FileRequest, bucket: Bucket, quota: Quota, now_s
         return FileAnswer(request.id, refused=why, again_s=_AGAIN_S)
     if file.parts == 1:
         addresses = [bucket.address(key, file)] if request.parts else []
-        return FileAnswer(request.id, key, addresses=addresses)
+        return FileAnswer(request.id, key, stored=False, addresses=addresses)
     if upload_id is None:
         upload_id = bucket.begin(key, file)
     there = bucket.parts(key, upload_id)
@@ -205,7 +205,7 @@ def answer(robot: str, request: FileRequest, bucket: Bucket, quota: Quota, now_s
         for part, sha256 in sorted(request.parts.items())
         if part not in there or there[part].sha256 != sha256
     ]
-    return FileAnswer(request.id, key, have=tuple(ranges(there)), addresses=addresses)
+    return FileAnswer(request.id, key, stored=False, have=tuple(ranges(there)), addresses=addresses)
 
 
 def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
@@ -248,7 +248,7 @@ def handler(event: Mapping[str, Any]) -> None:
         most=environment.upload_bytes_a_day,
     )
     state = answer(topic.robot, request, bucket, quota, time.time())
-    done = state.stored and request.parts_sha256 is not None
+    done = bool(state.stored) and request.parts_sha256 is not None
     emit(
         "upload",
         FilesAsked=1,

@@ -72,7 +72,7 @@ class Store:
             if n not in self.parts
         ]
         have = [(n, n) for n in sorted(self.parts)] if request.file.parts > 1 else []
-        return FileAnswer(request.id, key, have=have, addresses=addresses)
+        return FileAnswer(request.id, key, stored=False, have=have, addresses=addresses)
 
     @staticmethod
     def _size(request: FileRequest, part: int) -> int:

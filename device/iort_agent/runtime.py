@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from typing import Callable
 
@@ -113,12 +114,13 @@ class Runtime:
         return 0 if delivered and not failed else 1
 
     def tick(self) -> float:
-        """Do what is due of what cannot wait; when a silent stream's batch is to be closed."""
+        """Do what is due of what cannot wait. Return when the next is due: when a silent stream's batch is to
+        be closed; at once while the shadow is fetched, so that a short run reports itself too."""
         closes_at = self.agent.streams.tick()
         self.agent.record.tick()
         self.agent.live.tick()
         self.agent.shadow.tick()
-        return closes_at
+        return -math.inf if self.agent.shadow.fetching() else closes_at
 
     def tick_slowly(self) -> None:
         """Do what else is due; `run` calls it once a second."""

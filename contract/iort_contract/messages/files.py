@@ -87,13 +87,13 @@ class Address:
 
 @dataclass(frozen=True)
 class FileAnswer:
-    """``stored``: the bucket has the file under ``key``. Otherwise ``addresses`` are for missing parts, and
-    ``have`` lists the ranges (first, last) of stored parts. ``refused`` says why the request failed, and
+    """``stored``: whether the bucket has the file under ``key``. If not, ``addresses`` are for missing parts,
+    and ``have`` lists the ranges (first, last) of stored parts. ``refused`` says why the request failed, and
     ``again_s`` is the delay in seconds before another attempt; None: never."""
 
     id: str
     key: str | None = None
-    stored: bool = False
+    stored: bool | None = None
     have: Sequence[tuple[int, int]] = ()
     addresses: Sequence[Address] = ()
     refused: str | None = None
@@ -170,8 +170,8 @@ def _check_file_answer(answer: FileAnswer) -> None:
     check_id(answer.id, "id")
     if answer.again_s is not None:
         whole_number("again_s", answer.again_s, 0, _MAX_WAIT_S)
-    if answer.refused is None and answer.key is None:
-        raise ContractError("an answer must have a key, or say why not")
+    if answer.refused is None and (answer.key is None or answer.stored is None):
+        raise ContractError("an answer must have a key and say if the file is stored, or say why not")
 
 
 encode_file_answer, decode_file_answer = codec(

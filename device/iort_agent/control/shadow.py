@@ -168,6 +168,10 @@ class Shadow:
             if change:
                 self._publish(self._update, json.dumps({"state": {"reported": change}}).encode())
 
+    def fetching(self) -> bool:
+        """Whether the shadow is to be fetched, or its answer is awaited."""
+        return self._fetch_at is not None
+
     def known(self) -> bool:
         """Whether the operator's settings are known: fetched on this connection, and no change was missed."""
         return self._reported is not None and self._fetch_at is None

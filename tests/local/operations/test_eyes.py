@@ -124,7 +124,7 @@ def test_the_platform_dashboard_shows_warnings_of_functions(embedded, bundle):
 
     line = until(lambda: next((row for row in told() if robot.name in row["@message"]), None))
     assert line["@message"].startswith("[WARNING]")
-    assert "refused a request" in line["@message"]
+    assert "refused a message" in line["@message"]
     assert "Upload" in line["@log"]
 
 

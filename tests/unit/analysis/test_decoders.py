@@ -192,7 +192,9 @@ DECODERS: Mapping[str, Decoder] = {
         files.decode_file_answer,
         (
             files.encode_file_answer(
-                files.FileAnswer(RUN, "k", have=((1, 2),), addresses=(files.Address(3, "u", {"a": "b"}),))
+                files.FileAnswer(
+                    RUN, "k", stored=False, have=((1, 2),), addresses=(files.Address(3, "u", {"a": "b"}),)
+                )
             ),
         ),
     ),

@@ -127,7 +127,7 @@ def test_a_request_asks_for_at_most_as_many_addresses_as_fit_a_message():
     with pytest.raises(ContractError, match="at most 16"):
         encode_file_request(FileRequest(ID, large, dict.fromkeys(range(1, 18), "a" * 64)))
     longest = Address(10_000, "https://x/" + "u" * 3000, {"x-amz-checksum-sha256": "c" * 44})
-    answer = FileAnswer(ID, "k" * 500, addresses=[longest] * MAX_ADDRESSES)
+    answer = FileAnswer(ID, "k" * 500, stored=False, addresses=[longest] * MAX_ADDRESSES)
     assert len(encode_file_answer(answer)) < MAX_MESSAGE_BYTES
 
 
@@ -136,7 +136,11 @@ def test_a_request_asks_for_at_most_as_many_addresses_as_fit_a_message():
     [
         FileAnswer(ID, "robots/car/x", stored=True),
         FileAnswer(
-            ID, "robots/car/x", have=((1, 3), (5, 5)), addresses=(Address(4, "https://x", {"a": "b"}),)
+            ID,
+            "robots/car/x",
+            stored=False,
+            have=((1, 3), (5, 5)),
+            addresses=(Address(4, "https://x", {"a": "b"}),),
         ),
         FileAnswer(ID, refused="no", again_s=60),
         FileAnswer(ID, refused="never"),

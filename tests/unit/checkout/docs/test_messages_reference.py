@@ -138,9 +138,9 @@ WRITTEN: dict[str, tuple[bytes, Callable[[dict[str, Any]], Any], Any]] = {
         FileRequest(ASKED, FILE, {1: HASH}),
     ),
     "answer": (
-        encode_file_answer(FileAnswer(ASKED, KEY, addresses=[ADDRESS])),
+        encode_file_answer(FileAnswer(ASKED, KEY, stored=False, addresses=[ADDRESS])),
         as_object(decode_file_answer),
-        FileAnswer(ASKED, KEY, addresses=(ADDRESS,)),
+        FileAnswer(ASKED, KEY, stored=False, addresses=(ADDRESS,)),
     ),
     "refused": (
         encode_file_answer(REFUSED),
