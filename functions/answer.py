@@ -52,19 +52,23 @@ class Desk(NamedTuple):
 
 def serve(event: Mapping[str, Any], desk: Desk, now_s: float) -> None:
     """Answer a rule's event. Any error is told to the robot, and raised: `ContractError` for a malformed
-    question, which the quarantine keeps."""
+    question, which the quarantine keeps; `RuntimeError` where the answer itself is at fault."""
     topic = parse_topic(event[TOPIC])
     message = event_message(event)
     request_id = ask_id(message)
     try:
         ask = decode_ask(message)
+    except ContractError as error:
+        _refuse(topic, request_id, Refusal(MALFORMED, str(error)), desk)
+        raise
+    try:
         body = _answered(topic, ask, ask.deadline_us(event[RECEIVED_MS]), desk, now_s)
     except RefusedError as error:
         _refuse(topic, request_id, error.refusal, desk)
         return
     except ContractError as error:
-        _refuse(topic, request_id, Refusal(MALFORMED, str(error)), desk)
-        raise
+        _refuse(topic, request_id, Refusal(FAILED, type(error).__name__), desk)
+        raise RuntimeError(f"the answer cannot be made: {error}") from error
     except Exception as error:
         _refuse(topic, request_id, Refusal(FAILED, type(error).__name__), desk)
         raise

@@ -44,6 +44,7 @@ from iort_contract.archive import (
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.dynamodb import plain, starting_between, whole
+from iort_contract.limits import ContractError
 from iort_contract.tables import BATCH, EXPIRES_S, PUT_OFF_TO_S, ROBOT, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic, parse_topic
 
@@ -190,9 +191,14 @@ def sweep(archive: Archive, topic: str, now_ms: int, *, every: bool) -> dict[str
 
 
 def _archived(archive: Archive, topic: str, first: Hour) -> dict[str, ArchivedHour]:
-    """The archived hours since the first one."""
-    pages = archive.manifest.pages(topic, hours_between(first, None))
-    return {row.hour: row for page in pages for item in page.items for row in (archived_hour(item),)}
+    """The archived hours since the first one; one whose row is damaged counts as not archived."""
+    rows = {}
+    for page in archive.manifest.pages(topic, hours_between(first, None)):
+        for item in page.items:
+            with suppress(ContractError):
+                row = archived_hour(item)
+                rows[row.hour] = row
+    return rows
 
 
 def _count(archive: Archive, topic: str, hour: Hour) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, NoReturn
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V, RULES, Call, Rule
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
@@ -308,6 +308,15 @@ class Settings(BaseModel):
     def account_wide(self) -> bool:
         """Whether any setting of the whole account is on."""
         return not self.embedded and (self.device_defender or self.iot_log_level != "off")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_flag_is_a_number(cls, given: dict[str, Any]) -> dict[str, Any]:
+        """Pydantic reads ``true`` in cdk.json as 1, which nobody means by it."""
+        for key, value in given.items():
+            if isinstance(value, bool) and cls.model_fields[key].annotation is not bool:
+                raise ValueError(f"{key} must be a number or text, got {value}")
+        return given
 
     @classmethod
     def from_context(cls, app: App) -> Settings:

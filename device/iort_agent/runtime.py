@@ -60,7 +60,7 @@ class Runtime:
     def stop(self) -> None:
         """End the run in good order; may be called from any thread and from a signal handler."""
         self._asked = True
-        self._stop.set()
+        self._end_all()
 
     def run(self, *, drain_s: float | None) -> int:
         """Run until every source has ended or `stop` is called, then deliver the rest within ``drain_s``.
@@ -90,7 +90,7 @@ class Runtime:
             thread.start()
         if sources:
             self._stop.wait()
-        self._stop.set()
+        self._end_all()
         stopped = self._asked or self._broken
         if agent.downlink is not None:
             # An agent that ends by itself must not end an emergency stop.
@@ -142,9 +142,14 @@ class Runtime:
         clock = self.agent.clock
         slow_at = self._measured = self._repeated = clock.monotonic()
         self.agent.accounts.tell()
-        wait_s = _TICK_S
-        while not clock.wait(self._stop, wait_s):
+        wait_s, ticked_at, changed = _TICK_S, -math.inf, self.agent.shadow.changed
+        while not self._stop.is_set():
+            if clock.wait(changed, wait_s):
+                changed.clear()
+                if clock.wait(self._stop, max(0.0, ticked_at + _LEAST_S - clock.monotonic())):
+                    return
             closes_at, now = self.tick(), clock.monotonic()
+            ticked_at = now
             wait_s = min(_TICK_S, max(_LEAST_S, closes_at - now))
             if now >= slow_at:
                 slow_at = now + _SLOW_S - _TICK_S / 2
@@ -166,7 +171,12 @@ class Runtime:
     def _end(self) -> None:
         """End the run in good order, and with status 1: a thread has failed for good."""
         self._broken = True
+        self._end_all()
+
+    def _end_all(self) -> None:
         self._stop.set()
+        # The ticker waits for this one.
+        self.agent.shadow.changed.set()
 
     def _thread_of(self, i: int, source: SourceRun) -> Supervised:
         emit: Emit = self.agent.streams.emit
@@ -179,7 +189,7 @@ class Runtime:
         with self._lock:
             self._running -= 1
             if not self._running:
-                self._stop.set()
+                self._end_all()
 
     def _check_sources(self) -> None:
         streams = self.agent.streams.counts()

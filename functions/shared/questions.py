@@ -53,7 +53,10 @@ class Bodies:
 
     def read(self, robot: str, question: Question, content: Content) -> Mapping[str, Any]:
         """The body of a question; raises `RefusedError`. A robot can name only its own files."""
-        key = parse_file_key(content.place)
+        try:
+            key = parse_file_key(content.place)
+        except ContractError as error:
+            raise RefusedError(INVALID, str(error)) from error
         if key.robot != robot or not key.name.startswith(f"{ASK_FOLDER}/"):
             raise RefusedError(INVALID, f"the file must be {robot}'s own, in {ASK_FOLDER}/")
         check_size(content.size, question.max_question_bytes)

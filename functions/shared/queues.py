@@ -14,7 +14,6 @@ from botocore.exceptions import BotoCoreError, ClientError
 from functions.shared import clients
 from functions.shared.clients import variables
 from iort_contract.catalog.environments import EchoEnvironment
-from iort_contract.checks import shown
 from iort_contract.limits import ContractError
 from iort_contract.tables import BATCH, ITEM_BASE64, REASON, TOPIC
 
@@ -108,7 +107,8 @@ def quarantined(serve: Callable[[Any], None]) -> Callable[[Any, Any], None]:
         try:
             serve(event)
         except ContractError as error:
-            _log.warning("refused a message of %s: %s", shown(event.get(TOPIC)), error)
+            topic = event.get(TOPIC) if isinstance(event, Mapping) else None
+            _log.warning("refused a message of %r: %s", topic, error)
             # The form of Lambda's record of a failed invocation: "Destination event format".
             record = {
                 "requestContext": {"functionArn": context.invoked_function_arn, "condition": "Refused"},

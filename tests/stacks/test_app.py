@@ -134,6 +134,8 @@ def test_the_context_sets_the_settings(settings, tmp_path):
         ({"namespace": "lab-2"}, ["namespace", "'lab-2'"]),
         ({"namespace": ""}, ["namespace", "''"]),
         ({"namespace": 7}, ["namespace", "7"]),
+        ({"retention_days": True}, ["retention_days", "True"]),
+        ({"stream_behind_s": True}, ["stream_behind_s", "True"]),
         ({"retention_days": "0"}, ["retention_days", "'0'", "greater than or equal to 1"]),
         ({"retention_days": "1.5"}, ["retention_days", "'1.5'"]),
         ({"retention_days": 1.5}, ["retention_days", "1.5"]),

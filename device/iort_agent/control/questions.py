@@ -84,10 +84,10 @@ class Questions:
             try:
                 payload = self._encoded(request_id, body, until, wait)
                 topic = self._link.topic(ASK, name)
-                while not self._link.rate_limiter.may_go(STEADY, topic, len(payload)):
-                    if self._clock.wait(wait.ended, _NO_ROOM_S):
-                        break
-                else:
+                over = wait.ended.is_set()
+                while not over and not self._link.rate_limiter.may_go(STEADY, topic, len(payload)):
+                    over = self._clock.wait(wait.ended, _NO_ROOM_S)
+                if not over:
                     self._link.publish(topic, payload, qos=1, done=wait.published)
                     self._clock.wait(wait.ended, None)
             finally:

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import logging
 import math
+import threading
 from pathlib import Path
 from typing import Any, Callable, Iterable, Mapping
 
@@ -147,6 +148,8 @@ class Shadow:
         self._fetch_at: float | None = None
         # Whether the state may have changed since the last report; any thread sets it, the ticker clears it.
         self._news = False
+        # Set with it: the ticker, which clears it, waits no longer. An emergency stop's word is such news.
+        self.changed = threading.Event()
         # When the ticker repeats a report that is not confirmed.
         self._again_at = math.inf
         for topic_filter, handler in self._filters.items():
@@ -186,6 +189,7 @@ class Shadow:
             del self._answers[next(iter(self._answers))]
         self._answers[name] = Outcome(command.session, command.seq, outcome)
         self._news = True
+        self.changed.set()
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - the uplink's signature
         self._fetch_at = self._clock.monotonic() if connected else None
@@ -266,6 +270,7 @@ class Shadow:
             self.settings = settings
             self._apply(settings)
         self._news = True
+        self.changed.set()
 
     def _note_over_share(self, over_share: OverShare) -> None:
         """Note that the cloud put off batches, and log it once."""

@@ -249,7 +249,7 @@ class LiveLane:
             slot.urgent = urgent
             slot.t_us, slot.values, slot.newest, slot.offered = t_us, values, values, now
             slot.offers += 1
-            if not more if now >= slot.due else slot.is_urgent(now):
+            if slot.is_urgent(now) or (now >= slot.due and not more):
                 self._take_turn(slot, now)
             self._serve(now)
             # Another fault code may come at any time, and does not wait for a slow rate.

@@ -39,6 +39,8 @@ class Session:
         self._messages: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
         # Why the broker did not accept; what it said, if it answered; the client's error, if it did not.
         self.failure, self.refusal, self.error = "no answer", "", ""
+        # Why the connection ended before `close`, such as another client with this name.
+        self.lost = ""
         self.client: Any = mqtt5_client_builder.mtls_from_bytes(
             certificate,
             private_key,
@@ -52,6 +54,7 @@ class Session:
             on_publish_received=self._on_publish,
             on_lifecycle_connection_success=self._on_success,
             on_lifecycle_connection_failure=self._on_failure,
+            on_lifecycle_disconnection=self._on_disconnection,
             on_lifecycle_stopped=lambda _: self._stopped.set(),
         )
 
@@ -73,7 +76,8 @@ class Session:
             raise RefusalError(code_name(code))
 
     def round_trip(self, topic: str, payload: bytes, answer_topic: str, timeout_s: float) -> bytes | None:
-        """Publish a message, and return the next one on a topic; None without one in time."""
+        """Publish a message, and return the next one on a topic; None without one in time. Raises
+        `RefusalError` if the connection ends meanwhile."""
         until = time.monotonic() + timeout_s
         self.client.publish(mqtt5.PublishPacket(topic=topic, payload=payload, qos=mqtt5.QoS.AT_MOST_ONCE))
         while (left_s := until - time.monotonic()) > 0:
@@ -81,6 +85,8 @@ class Session:
                 answered, answer = self._messages.get(timeout=left_s)
             except queue.Empty:
                 break
+            if self.lost:
+                raise RefusalError(self.lost)
             if answered == answer_topic:
                 return answer
         return None
@@ -88,6 +94,11 @@ class Session:
     def _on_publish(self, data: Any) -> None:
         packet = data.publish_packet
         self._messages.put((packet.topic, bytes(packet.payload or b"")))
+
+    def _on_disconnection(self, data: Any) -> None:
+        packet = data.disconnect_packet
+        self.lost = said(packet) if packet is not None else explain(data.exception)
+        self._messages.put(("", b""))  # ends a wait for an answer
 
     def _on_success(self, _: Any) -> None:
         self._connected = True

@@ -436,7 +436,7 @@ def _read_directly(handlers: Mapping[str, Sequence[OnBytes]]) -> None:
     """
     transports = importlib.import_module("rospy.impl.tcpros_base").TCPROSTransport
     subscription = importlib.import_module("rospy.impl.tcpros_pubsub").TCPROSSub
-    ended: Any = importlib.import_module("rospy.exceptions").TransportTerminated
+    exceptions: Any = importlib.import_module("rospy.exceptions")
     receive_once, read_size = transports.receive_once, struct.Struct("<I").unpack
 
     def receive(transport: Any) -> list[Any]:
@@ -448,11 +448,17 @@ def _read_directly(handlers: Mapping[str, Sequence[OnBytes]]) -> None:
         # rospy may close its descriptor at any time, and the number may then be another file's.
         with os.fdopen(os.dup(transport.socket.fileno()), "rb", protocol.buff_size) as stream:
             while not transport.done:
-                head = stream.read(4)
-                size = read_size(head)[0] if len(head) == 4 else 1
-                data = stream.read(size)
+                size = 1
+                try:
+                    head = stream.read(4)
+                    size = read_size(head)[0] if len(head) == 4 else 1
+                    data = stream.read(size)
+                except MemoryError as error:
+                    # What follows would be read from the middle of a message. rospy connects again.
+                    _log.error("topic %s: no memory for %d bytes", protocol.resolved_name, size)
+                    raise exceptions.TransportException("no memory for a message") from error
                 if len(data) != size:
-                    raise ended("the publisher has closed the connection")
+                    raise exceptions.TransportTerminated("the publisher has closed the connection")
                 try:
                     for take in takers:
                         take(header, data)

@@ -110,7 +110,11 @@ class Intake:
         with self._inbox_lock:
             while self._inbox:
                 header, data, arrival_us = self._inbox.popleft()
-                self.take(header, data, arrival_us, more=bool(self._inbox))
+                try:
+                    self.take(header, data, arrival_us, more=bool(self._inbox))
+                except Exception:  # noqa: BLE001 - whatever it is, the others must be heard
+                    # A failing disk or a full memory costs this message, and neither the topic nor others.
+                    _log.exception("topic %s: a message could not be taken", self._topic)
 
     def take(
         self, header: Mapping[str, str], data: bytes, arrival_us: int | None = None, *, more: bool = False

@@ -120,6 +120,8 @@ class Ros1Source:
                     intake.sim_time = node.sim_time
                     if node.ready.is_set():
                         intake.look(functools.partial(node.connections, topic))
+                    else:
+                        intake.take_received()
         finally:
             for topic, intake in self._intakes.items():
                 node.unsubscribe(topic, intake.receive)

@@ -312,7 +312,8 @@ def _broker(config: Config) -> Generator[Finding, None, _Offset | None]:
                 f"is `namespace: {config.namespace}` the deployment's, and is it deployed whole? "
                 "`iort doctor` there"
             )
-            yield Finding("rules", WARN, f"the cloud's rules do not answer: {error}", todo)
+            why = str(error) or session.lost or "nothing in time"
+            yield Finding("rules", WARN, f"the cloud's rules do not answer: {why}", todo)
             return None
         return offset
     finally:

@@ -110,7 +110,12 @@ def _computed(
     batches = chain(earlier, recorded.batches(keys, wanted))
     summaries = summarize_seconds(batches, first, end, vehicle)
     while some := list(islice(summaries, _SECONDS)):
-        yield _block([{tables.SECOND: second, **flat_second(summary)} for second, summary in some])
+        yield _block([{tables.SECOND: second, **_floats(flat_second(summary))} for second, summary in some])
+
+
+def _floats(second: Mapping[str, Any]) -> dict[str, Any]:
+    """As numbers come out of the table: whole ones beyond 2^53 would make a column of objects."""
+    return {name: float(value) if type(value) is int else value for name, value in second.items()}
 
 
 def _needs(selection: Selection) -> Callable[[str], bool]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import json
 import math
+import resource
 import socket
 import struct
 import sys
 import threading
+from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
@@ -303,7 +305,7 @@ def test_messages_are_handed_over_as_they_are_on_the_socket(
     for name, module in (
         ("impl.tcpros_base", SimpleNamespace(TCPROSTransport=transports)),
         ("impl.tcpros_pubsub", SimpleNamespace(TCPROSSub=Subscription)),
-        ("exceptions", SimpleNamespace(TransportTerminated=EOFError)),
+        ("exceptions", SimpleNamespace(TransportTerminated=EOFError, TransportException=BufferError)),
     ):
         monkeypatch.setitem(sys.modules, f"rospy.{name}", module)
     node._read_directly({TOPIC: [take]})
@@ -317,6 +319,19 @@ def test_messages_are_handed_over_as_they_are_on_the_socket(
             transport.receive_once()
     assert taken == [(Transport.header, data) for data in messages]
     assert "a message could not be taken" in caplog.text
+    # A message beyond the memory ends the connection: what follows is the middle of a message.
+    publisher, transport.socket = socket.socketpair()
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 2**30, limits[1]))
+    try:
+        with transport.socket, publisher:
+            publisher.sendall(struct.pack("<I", 2**32 - 1) + struct.pack("<I", 1) * 50)
+            with pytest.raises(BufferError):
+                transport.receive_once()
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+    assert len(taken) == len(messages)
     # rospy's own way for what came with the header, and for a service.
     assert transports(Subscription(), early=b"rest").receive_once() == [b"rest"]
     assert transports(SimpleNamespace()).receive_once() == [b""]

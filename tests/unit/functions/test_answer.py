@@ -196,6 +196,11 @@ def test_an_error_is_told_to_the_robot_and_fails_the_invocation(serve):
     with pytest.raises(ZeroDivisionError):
         serve(ask())
     assert serve.said[-1][1].body == Refusal(FAILED, "ZeroDivisionError")
+    # No question is malformed because its answer is: the invocation fails, and nothing is quarantined.
+    serve.work = lambda *_: {"speed_mps": float("nan")}
+    with pytest.raises(RuntimeError, match="the answer cannot be made"):
+        serve(ask())
+    assert serve.said[-1][1].body == Refusal(FAILED, "ContractError")
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ from iort_contract.archive import (
 )
 from iort_contract.tables import BATCH, EXPIRES_S, ROBOT, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
+from testkit.dynamodb import ARCHIVE as MANIFEST
 from testkit.dynamodb import FILES, ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of_message, record_of
 from tests.unit.functions.archiving import (
     CAR,
@@ -509,6 +510,16 @@ def test_a_sweep_finds_hours_without_a_mark(cloud):
     # The operator asks for all, at any time; the hour that is not over stays.
     now_ms = HOUR_1.start_us // 1000 + HOUR_REST_MS
     assert function.perform({TASK: SWEEP, TOPIC: TOPIC_OF_CAR, ALL: True}, now_ms) == {"tasks": 1}
+
+
+def test_a_damaged_row_of_the_manifest_stops_no_sweep(cloud):
+    for hour in (HOUR_0, HOUR_1):
+        cloud.store(0, [1, 1, 1], hour)
+    cloud.archived(HOUR_0)
+    lose_mark(cloud, HOUR_1)
+    (row,) = (row for row in cloud.dynamodb.scan(TableName=MANIFEST)["Items"] if "sha256" in row)
+    cloud.dynamodb.put_item(TableName=MANIFEST, Item=row | {"sha256": {"N": "1"}})
+    assert str(HOUR_1) in swept(cloud, **{ALL: True})
 
 
 def test_a_sweep_finds_a_late_batch_without_a_mark_before_the_hour_expires(cloud):

@@ -74,7 +74,7 @@ class BagConfig(SourceConfig):
         if first is None:
             yield Finding(title, FAIL, f"it has no message of {', '.join(self.streams())}", "see `topics`")
         else:
-            yield Finding(title, OK, f"can be played, as {', '.join(self.streams())}")
+            yield Finding(title, OK, f"can be opened, for {', '.join(self.streams())}")
 
 
 class BagSource:

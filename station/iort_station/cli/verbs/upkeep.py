@@ -264,10 +264,18 @@ def verify(
     Fails if anything is missing. `iort doctor --deep` looks at every stream, and at files.
     """
     cloud = context.obj.cloud()
-    topics = archive.topics(cloud, robot, stream)
-    rows = [row for topic in topics if (row := _verified(cloud, topic))["hours"] or row["problems"]]
-    listing(rows, dict, _show_verified, as_json=as_json, none=_EMPTY)
-    if wrong := sum(len(row["problems"]) for row in rows):
+    wrong = 0
+
+    def rows() -> Iterator[dict[str, Any]]:
+        nonlocal wrong
+        for topic in archive.topics(cloud, robot, stream):
+            row = _verified(cloud, topic)
+            wrong += len(row["problems"])
+            if row["hours"] or row["problems"]:
+                yield row
+
+    listing(rows(), dict, _show_verified, as_json=as_json, none=_EMPTY)
+    if wrong:
         raise StationError(
             f"{wrong} hours are not as they should be: `iort archive run`, then look at `iort alarms`"
         )

@@ -80,6 +80,10 @@ def test_another_fault_code_among_samples_that_come_together_is_sent() -> None:
         next_at = rig.lane.offer("vesc", rig.clock.now_us(), {"fault_code": code}, more=True)
     assert [live.sample.get("fault_code") for live in rig.sent()] == [None, 0]
     assert next_at == pytest.approx(rig.clock.monotonic() + 0.1), "whatever the rate is"
+    rig.clock.advance(10)
+    for code, more in ((0, True), (3, True), (0, False)):
+        rig.lane.offer("vesc", rig.clock.now_us(), {"fault_code": code}, more=more)
+    assert [live.sample.get("fault_code") for live in rig.sent()][2:] == [3], "also where the last is due"
 
 
 def test_slightly_late_samples_do_not_lower_the_rate() -> None:

@@ -36,7 +36,7 @@ def mcap_of(folder: Path) -> Path:
 )
 def test_a_recording_that_can_be_played(tmp_path: Path, settings: str, streams: str) -> None:
     finding = found(tmp_path, write_ros1(tmp_path / "a.bag"), settings)
-    assert (finding.level, finding.text) == (OK, f"can be played, as {streams}")
+    assert (finding.level, finding.text) == (OK, f"can be opened, for {streams}")
 
 
 def test_a_log_that_can_be_played(tmp_path: Path) -> None:

@@ -30,10 +30,15 @@ class Desk:
         self.more: list[bool] = []
         # Until when the live lane wants none.
         self.next_at = 0.0
+        # How many samples a full disk refuses.
+        self.fails = 0
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
         self.intake = Intake("/t", config, emit=self._emit, clock=self.clock, large=config.large)
 
     def _emit(self, stream: str, t_us: int, values: Any, *, more: bool = False) -> float:
+        if self.fails:
+            self.fails -= 1
+            raise OSError("the disk is full")
         if stream != TYPES_STREAM:
             self.samples.append((stream, t_us, values))
             self.more.append(more)
@@ -60,6 +65,18 @@ def test_messages_wait_until_the_live_lane_wants_one() -> None:
     for _ in range(16):
         desk.intake.receive(header, b"\x04")
     assert len(desk.samples) == 20, "or until they are many"
+
+
+def test_a_message_that_cannot_be_taken_costs_no_other_one(caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk(time="arrival")
+    desk.next_at, header = desk.clock.monotonic() + 0.1, {**CONNECTION, "message_definition": "uint8 u"}
+    desk.intake.receive(header, b"\x00")
+    desk.fails = 1
+    for data in (b"\x01", b"\x02"):
+        desk.intake.receive(header, data)
+    desk.intake.take_received()
+    assert [values["u"] for _, _, values in desk.samples] == [0, 2]
+    assert "topic /t: a message could not be taken" in caplog.text
 
 
 def test_the_last_message_of_a_silent_topic_waits_for_the_next_look() -> None:

@@ -72,6 +72,8 @@ def drive() -> list[tuple[str, dict]]:
                 "speed": [seq % 50 + i / 8 for i in range(10)],
                 "temp_motor": [20 - 293.15 * (seq == 5)] * 10,
             }
+            if seq % 2:
+                columns["stamp_ns"] = [t * 1000 + 7 + i for i in range(10)]
             if seq % 90 > 60:
                 columns |= {
                     "armed": [i % 2 == 0 for i in range(10)],
