@@ -28,12 +28,12 @@ settings.register_profile("fast", settings.get_profile("iort"), max_examples=10,
 GROUPS = {
     "tests/local/commands/test_demo.py": "demo",
     "tests/local/commands/": "cloud of the data",
+    # Before the others have raised the alarms that it waits for.
+    "tests/local/operations/test_eyes.py": "cloud of the data",
     "tests/local/data/": "cloud of the data",
     "tests/ros/test_two_robots.py": "cloud of the data",
     # It analyses every drive that the cloud has.
     "tests/local/analysis/": "cloud of the faults",
-    # Before the others have raised the alarms that it waits for.
-    "tests/local/operations/test_eyes.py": "cloud of the faults",
     "tests/local/operations/": "cloud of the faults",
     "tests/local/page/": "cloud of the faults",
     "tests/local/faults/": "cloud of the faults",
