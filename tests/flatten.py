@@ -5,7 +5,7 @@ header and a type's constants are left out. A message of a header and exactly on
 (VescStateStamped, PoseStamped) gives the nested message's fields without a prefix, since the stamp is the
 sample's time.
 
-This is the rule of `iort_contract.ros1.decode`, for objects of other libraries. Tests compare the decoder
+This is the rule of `iort_contract.ros.decode`, for objects of other libraries. Tests compare the decoder
 with it.
 """
 

@@ -6,7 +6,7 @@ import base64
 import math
 from typing import Any
 
-from iort_contract.ros1.definition import DURATION, LETTERS, STRING, TIME, Definition, Field
+from iort_contract.ros.definition import DURATION, LETTERS, STRING, TIME, Definition, Field
 
 
 def as_rosbridge(

@@ -21,7 +21,7 @@ from typing import Any, Mapping
 from aiohttp import WSMsgType, web
 from typing_extensions import Self
 
-from iort_contract.ros1.definition import DURATION, TIME, Field, parse
+from iort_contract.ros.definition import DURATION, TIME, Field, parse
 from testkit.ports import free_port
 
 

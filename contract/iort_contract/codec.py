@@ -26,7 +26,7 @@ from iort_contract.limits import (
 from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
 
 # Batches stay readable for ever. `SERIALIZED_CODEC` keeps ROS messages byte for byte:
-# contract/iort_contract/ros1/message.py.
+# contract/iort_contract/ros/message.py.
 CODEC, SERIALIZED_CODEC = "steps", "ros1"
 # A step has half the characters of its value, and takes as much memory.
 _MOST_BYTES = {CODEC: MAX_COLUMNS_BYTES // 2, SERIALIZED_CODEC: MAX_COLUMNS_BYTES + 2 * 1024 * 1024}

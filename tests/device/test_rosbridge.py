@@ -25,7 +25,7 @@ from iort_agent.config import load_config
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.rosbridge import RosbridgeConfig, RosbridgeSource, TopicConfig
 from iort_agent.sources.rosbridge.connection import Times
-from iort_contract.ros1.message import message_type
+from iort_contract.ros.message import message_type
 from testkit.ports import free_port
 from testkit.waiting import until
 from tests.device.running import Running

@@ -13,7 +13,7 @@ import pytest
 
 from iort_agent.common.threads import SystemClock
 from iort_agent.sources.recording import BagConfig
-from iort_contract.ros1.message import MessageType, RosMessage, message_type
+from iort_contract.ros.message import MessageType, RosMessage, message_type
 from iort_station.data import bags
 from tests.recordings import recording
 from tests.ros.conftest import Graph

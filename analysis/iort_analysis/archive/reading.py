@@ -20,7 +20,7 @@ from iort_contract.codec import CODEC, SERIALIZED_CODEC, packed_samples
 from iort_contract.dynamodb import Item, Keys, starting_between
 from iort_contract.limits import BATCH_VERSION, Value
 from iort_contract.messages.batch import batch_id
-from iort_contract.ros1.message import Messages, pack
+from iort_contract.ros.message import Messages, pack
 from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, RECEIVED_MS, SAMPLES, TOPIC
 
 # In the file's metadata: the first row group and the number of them by hour, and the fields' kinds.

@@ -40,8 +40,8 @@ from iort_contract.codec import EXACT, packed_samples, unpacked
 from iort_contract.dynamodb import Item, plain, whole
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.batch import Envelope, open_envelope, read_envelope
-from iort_contract.ros1.columns import view
-from iort_contract.ros1.message import Messages, unpack
+from iort_contract.ros.columns import view
+from iort_contract.ros.message import Messages, unpack
 from iort_contract.tables import BATCH, EXPIRES_S, NONFINITE, PREVIOUS, RECEIVED_MS
 
 # Stored items in pieces: some thousand batches decoded to a table each, and what is refused.

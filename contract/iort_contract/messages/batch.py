@@ -40,8 +40,8 @@ from iort_contract.limits import (
     ContractError,
     Value,
 )
-from iort_contract.ros1.columns import as_columns, from_columns, values_a_message, view
-from iort_contract.ros1.message import Messages, pack, unpack
+from iort_contract.ros.columns import as_columns, from_columns, values_a_message, view
+from iort_contract.ros.message import Messages, pack, unpack
 from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, RECEIVED_MS, ROBOT, SAMPLES, TOPIC
 from iort_contract.topics import RECORD, Topic, parse_topic
 

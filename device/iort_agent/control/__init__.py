@@ -8,7 +8,7 @@ from typing import Callable
 from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.state import ClockOffset
 from iort_agent.mqtt.uplink import Link
-from iort_agent.ros1 import Graph
+from iort_agent.ros import Graph
 
 _log = logging.getLogger(__name__)
 

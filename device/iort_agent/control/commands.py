@@ -16,7 +16,7 @@ from iort_agent.control.guard import Guard
 from iort_agent.control.leases import STOP_AHEAD_MS, Leases, Limits
 from iort_agent.errors import ConfigError
 from iort_agent.mqtt.uplink import Link, MqttMessage, OnMessage
-from iort_agent.ros1.json_message import encode
+from iort_agent.ros.json_message import encode
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.commands import (
     NO_COMMAND,
@@ -28,7 +28,7 @@ from iort_contract.messages.commands import (
     DriveLimits,
     decode_command,
 )
-from iort_contract.ros1.definition import Definition
+from iort_contract.ros.definition import Definition
 from iort_contract.topics import ACCEPTED, CMD
 
 _log = logging.getLogger(__name__)

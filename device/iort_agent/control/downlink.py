@@ -18,8 +18,8 @@ from iort_agent.control.questions import Asks, Questions
 from iort_agent.errors import SourceError
 from iort_agent.files.upload import Uploader, downloader
 from iort_agent.mqtt.uplink import Link
-from iort_agent.ros1 import Graph
-from iort_agent.ros1.node import DEFAULT_NODE, Node, shared
+from iort_agent.ros import Graph
+from iort_agent.ros.ros1_node import DEFAULT_NODE, Node, shared
 from iort_agent.sources.ros1 import Ros1Config
 
 _log = logging.getLogger(__name__)

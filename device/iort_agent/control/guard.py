@@ -27,8 +27,8 @@ from typing import Any, Mapping
 
 from iort_agent.common.threads import Clock, Supervised, SystemClock
 from iort_agent.control.leases import Stops
-from iort_agent.ros1.json_message import encode
-from iort_agent.ros1.node import Node, shared
+from iort_agent.ros.json_message import encode
+from iort_agent.ros.ros1_node import Node, shared
 
 _log = logging.getLogger("iort_agent.guard")
 

@@ -10,10 +10,10 @@ from iort_agent.control import Bridge
 from iort_agent.control.config import ROBOT_IN_TOPIC, DownlinkConfig, FleetConfig, ShareConfig
 from iort_agent.mqtt.rate_limiter import STEADY
 from iort_agent.mqtt.uplink import MqttMessage
-from iort_agent.ros1.json_message import decode, encode
+from iort_agent.ros.json_message import decode, encode
 from iort_contract.limits import ContractError, MessageError
 from iort_contract.messages.commands import FLEET_MAX_AGE_MS, FleetMessage, decode_fleet, encode_fleet
-from iort_contract.ros1.definition import Definition, parse
+from iort_contract.ros.definition import Definition, parse
 from iort_contract.topics import FLEET, parse_topic
 
 # Each robot needs a ROS topic; a lab has fewer robots than this.

@@ -24,7 +24,7 @@ from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.rate_limiter import STEADY
 from iort_agent.mqtt.requests import Pending, Requests
 from iort_agent.mqtt.uplink import Link
-from iort_agent.ros1.json_message import decode, encode
+from iort_agent.ros.json_message import decode, encode
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError, MessageError
 from iort_contract.messages.envelope import to_json

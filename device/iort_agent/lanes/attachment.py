@@ -23,7 +23,7 @@ from iort_agent.files.folder import FilesConfig, Uploads
 from iort_agent.sources import Emit
 from iort_contract.limits import Value
 from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS, File, file_key
-from iort_contract.ros1.message import RosMessage, cut
+from iort_contract.ros.message import RosMessage, cut
 
 _log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from iort_agent.spool import Spool
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import MAX_MESSAGE_BYTES, MAX_SAMPLES, ContractError, Value
 from iort_contract.messages.batch import Batch, encode_batch, split_batch
-from iort_contract.ros1.message import Messages, RosMessage
+from iort_contract.ros.message import Messages, RosMessage
 from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)

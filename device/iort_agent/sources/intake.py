@@ -16,13 +16,13 @@ from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.schema import choice, items, setting, text
 from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
-from iort_agent.ros1.types import installed
+from iort_agent.ros.ros1_types import installed
 from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
-from iort_contract.ros1.decode import Decoder, Large, stamp_ns
-from iort_contract.ros1.definition import Definition, parse
-from iort_contract.ros1.message import MessageType, RosMessage, RosType
+from iort_contract.ros.decode import Decoder, Large, stamp_ns
+from iort_contract.ros.definition import Definition, parse
+from iort_contract.ros.message import MessageType, RosMessage, RosType
 from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)

@@ -15,8 +15,8 @@ from typing import Any, Iterator, Sequence
 from iort_agent.common.schema import Place, choice, pairs, section, setting, text
 from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
-from iort_agent.ros1 import master
-from iort_agent.ros1.node import DEFAULT_NODE, Node, shared
+from iort_agent.ros import ros1_master
+from iort_agent.ros.ros1_node import DEFAULT_NODE, Node, shared
 from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake
 from iort_contract.limits import ContractError
@@ -83,10 +83,10 @@ class Ros1Config(SourceConfig):
         if importlib.util.find_spec("rospy") is None:
             todo = "source /opt/ros/noetic/setup.bash, in an environment made with --system-site-packages"
             yield Finding(title, FAIL, "Python finds no rospy", todo)
-        uri = master.uri()
+        uri = ros1_master.uri()
         try:
-            pid = master.Master(uri, "/iort_check").ask("getPid")
-        except master.ERRORS as error:
+            pid = ros1_master.Master(uri, "/iort_check").ask("getPid")
+        except ros1_master.ERRORS as error:
             todo = "start `roscore`, or set ROS_MASTER_URI (in the unit: /etc/iort/environment)"
             yield Finding(title, FAIL, f"no ROS master at {uri}: {error}", todo)
         else:

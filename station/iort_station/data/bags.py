@@ -14,8 +14,8 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from iort_contract.limits import MessageError
-from iort_contract.ros1.definition import md5sum as md5sum_of
-from iort_contract.ros1.definition import parse
+from iort_contract.ros.definition import md5sum as md5sum_of
+from iort_contract.ros.definition import parse
 from iort_station.errors import StationError
 from iort_station.output import whole
 

@@ -14,7 +14,7 @@ from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
 from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
-from iort_contract.ros1.message import ROS2, MessageType, filled
+from iort_contract.ros.message import ROS2, MessageType, filled
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, ros_messages

@@ -14,8 +14,8 @@ from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES
 from iort_contract.catalog.vesc import LOG_UNITS, VESC, VESC_STREAM
 from iort_contract.dynamodb import with_samples_between
 from iort_contract.limits import ContractError, MessageError
-from iort_contract.ros1.definition import Fields, parse
-from iort_contract.ros1.message import MessageType, message_type
+from iort_contract.ros.definition import Fields, parse
+from iort_contract.ros.message import MessageType, message_type
 from iort_contract.tables import STATS, STREAMS
 from iort_station.cloud import Cloud
 from iort_station.data.accounts import last_reports
@@ -66,7 +66,7 @@ def _by_type(kind: MessageType, path: str, *, ros2: bool) -> str:
     types = _fields_of_type(kind.kind, kind.definition)
     body = [field for field in types.get(kind.kind, ()) if field.name != "header"]
     # With a header and one other field, the sample's fields are that field's: see
-    # contract/iort_contract/ros1/decode.py.
+    # contract/iort_contract/ros/decode.py.
     starts = [body[0].kind, kind.kind] if len(body) == 1 else [kind.kind]
     return next(filter(None, (_on_the_way(types, start, path, ros2=ros2) for start in starts)), "")
 

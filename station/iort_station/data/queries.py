@@ -18,7 +18,7 @@ from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS
 from iort_contract.catalog.vesc import absent as is_absent
 from iort_contract.dynamodb import with_samples_between
-from iort_contract.ros1.message import MessageType
+from iort_contract.ros.message import MessageType
 from iort_contract.tables import STATS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 from iort_analysis.samples.blocks import Block, values
 from iort_contract.limits import MessageError, Value
-from iort_contract.ros1.decode import HEADER
-from iort_contract.ros1.definition import (
+from iort_contract.ros.decode import HEADER
+from iort_contract.ros.definition import (
     HEADER_TYPE,
     LETTERS,
     STRING,
@@ -23,7 +23,7 @@ from iort_contract.ros1.definition import (
     md5sum,
     parse,
 )
-from iort_contract.ros1.message import MessageType
+from iort_contract.ros.message import MessageType
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.errors import StationError

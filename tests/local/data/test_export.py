@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from iort_contract.ros1.decode import HEADER
+from iort_contract.ros.decode import HEADER
 from iort_station import data
 from iort_station.cloud import Cloud
 from tests.foxglove import flat, opened

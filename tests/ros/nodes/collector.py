@@ -18,7 +18,7 @@ from pathlib import Path
 from iort_agent.common.schema import Place, load
 from iort_agent.common.threads import SystemClock
 from iort_agent.sources.ros1 import Ros1Config
-from iort_contract.ros1.message import RosMessage
+from iort_contract.ros.message import RosMessage
 from tests.ros.nodes import say
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")

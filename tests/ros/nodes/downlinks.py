@@ -26,7 +26,7 @@ from iort_agent.control.guard import Guard
 from iort_agent.control.questions import Questions
 from iort_agent.files.upload import downloader, make_uploader
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.ros1.node import DEFAULT_NODE, shared
+from iort_agent.ros.ros1_node import DEFAULT_NODE, shared
 from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
 from iort_contract.messages.questions import Answer, Refusal, decode_ask, encode_answer
 from testkit.agent import Loopback, Published, link_of

@@ -8,7 +8,7 @@ import time
 import roslib.message
 import rospy
 
-from iort_agent.ros1 import master
+from iort_agent.ros import ros1_master
 from tests.ros.nodes import say
 
 
@@ -19,7 +19,7 @@ def plain(value):
 
 
 name, topic, kind = sys.argv[1:4]
-master.mend(f"/{name}")
+ros1_master.mend(f"/{name}")
 rospy.init_node(name, disable_signals=True)
 subscriber = rospy.Subscriber(
     topic,

@@ -34,7 +34,7 @@ from iort_contract.limits import MAX_FIELDS
 from iort_contract.messages.account import lost
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.messages.commands import DRIVE_TYPE
-from iort_contract.ros1.message import MessageType, message_type
+from iort_contract.ros.message import MessageType, message_type
 from testkit.agent import Loopback, MemorySpool, Published
 
 T0 = 1_700_000_000_000_000

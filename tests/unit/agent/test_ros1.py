@@ -18,13 +18,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iort_agent.ros1 import master, node
-from iort_agent.ros1.json_message import Writer, decode, encode
+from iort_agent.ros import ros1_master, ros1_node
+from iort_agent.ros.json_message import Writer, decode, encode
 from iort_contract.limits import MessageError
-from iort_contract.ros1.definition import parse
+from iort_contract.ros.definition import parse
 from tests.rosbridge_json import as_rosbridge
 from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, RULE, T0
-from tests.unit.contract.ros1.ros1_values import by_rosbags, definitions, values
+from tests.unit.contract.ros.ros1_values import by_rosbags, definitions, values
 
 MIXED = f"""bool b
 int8 small
@@ -236,8 +236,8 @@ def rospy(monkeypatch: pytest.MonkeyPatch) -> Rospy:
         ("registration", SimpleNamespace(get_topic_manager=lambda: found)),
     ):
         monkeypatch.setitem(sys.modules, f"rospy.impl.{name}", module)
-    monkeypatch.setattr(master, "proxy", lambda *_: found)
-    master.mend("/iort_agent")
+    monkeypatch.setattr(ros1_master, "proxy", lambda *_: found)
+    ros1_master.mend("/iort_agent")
     found.connect = lambda topic=TOPIC: handlers._connect_topic(found, topic, URI)
     return found
 
@@ -308,7 +308,7 @@ def test_messages_are_handed_over_as_they_are_on_the_socket(
         ("exceptions", SimpleNamespace(TransportTerminated=EOFError, TransportException=BufferError)),
     ):
         monkeypatch.setitem(sys.modules, f"rospy.{name}", module)
-    node._read_directly({TOPIC: [take]})
+    ros1_node._read_directly({TOPIC: [take]})
     messages = [b"one", b"", b"bad", b"x" * 1000]
     transport = transports(Subscription(resolved_name=TOPIC, buff_size=100))
     publisher, transport.socket = socket.socketpair()

@@ -27,7 +27,7 @@ from iort_agent.lanes import PingConfig
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.client import Broker
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.ros1.node import Node
+from iort_agent.ros.ros1_node import Node
 from iort_agent.runtime import Runtime
 from iort_agent.sources.sim import SimConfig
 from iort_agent.spool.sqlite import SqliteSpool
@@ -169,7 +169,7 @@ def ros1_node(kind: str, _folder: Path, patch: pytest.MonkeyPatch) -> None:
     )
     patch.setitem(sys.modules, "rosgraph", SimpleNamespace(get_master_uri=lambda: "http://127.0.0.1:1"))
     patch.setitem(sys.modules, "rosgraph.names", names)
-    patch.setattr("iort_agent.ros1.master.Master.unreachable", lambda _: surprise())
+    patch.setattr("iort_agent.ros.ros1_master.Master.unreachable", lambda _: surprise())
     ended = threading.Event()
     WATCH.on_end(ended.set)
     node = Node("iort_agent", Mock(), Trap("nobody"))

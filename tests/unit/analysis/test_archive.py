@@ -20,7 +20,7 @@ from iort_analysis.samples.blocks import join, values
 from iort_contract.archive import HASH, Hour, content_hash, hour_of, item_hash, parse_hour
 from iort_contract.dynamodb import plain, starting_between
 from iort_contract.messages.batch import Batch, messages_of
-from iort_contract.ros1.message import Messages, RosType
+from iort_contract.ros.message import Messages, RosType
 from iort_contract.tables import BATCH
 from testkit.dynamodb import TOPIC_OF_CAR, item_of, item_of_message
 from tests.ros1_strategies import definitions, messages

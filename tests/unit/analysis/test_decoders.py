@@ -24,15 +24,15 @@ from iort_contract.limits import ContractError
 from iort_contract.messages import account, analysis, batch, commands, files, live, questions
 from iort_contract.messages.envelope import event_message, rule_event
 from iort_contract.messages.shadow import decode_desired, decode_reported
-from iort_contract.ros1.columns import as_columns, decoder_of, from_columns, view
-from iort_contract.ros1.definition import parse
-from iort_contract.ros1.message import Messages, MessageType, RosType, message_type, pack, unpack
+from iort_contract.ros.columns import as_columns, decoder_of, from_columns, view
+from iort_contract.ros.definition import parse
+from iort_contract.ros.message import Messages, MessageType, RosType, message_type, pack, unpack
 from iort_contract.topics import parse_topic
 from iort_contract.track import parse_track, track_of
 from testkit.dynamodb import item_of
 from tests.examples import examples
 from tests.mutation import mutated_bytes, mutated_item, mutated_json, mutated_value
-from tests.unit.contract.ros1.ros1_messages import HEADER, header, text
+from tests.unit.contract.ros.ros1_messages import HEADER, header, text
 
 T_US, RUN = 1_700_000_000_000_000, "0badcafe"
 FLAT = RosType("/flat", "a_msgs/S", "2", "Header header\nfloat64 x\nuint8 n" + HEADER)

@@ -20,7 +20,7 @@ from bench.sections import (
 from bench.sections.round_trips import RAW
 from bench.sections.utilisation import BATCHES, Measured
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.ros1.definition import parse
+from iort_contract.ros.definition import parse
 from iort_contract.topics import BROKER, LAMBDA, RULE, live_topic, record_topic
 from testkit import ROOT
 from testkit.machine import Usage

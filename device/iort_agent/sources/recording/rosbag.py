@@ -19,9 +19,9 @@ from iort_agent.sources.recording.player import Message
 from iort_agent.sources.recording.reader import INDEX, Reader, wrapped
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
-from iort_contract.ros1.decode import Decoder, Large, stamp_ns
-from iort_contract.ros1.definition import md5sum, parse
-from iort_contract.ros1.message import ROS2, MessageType, RosMessage, RosType
+from iort_contract.ros.decode import Decoder, Large, stamp_ns
+from iort_contract.ros.definition import md5sum, parse
+from iort_contract.ros.message import ROS2, MessageType, RosMessage, RosType
 
 _log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from urllib.parse import SplitResult, urlsplit
 
 from iort_agent.common.schema import Place, number, pairs, section, setting, text
 from iort_agent.common.threads import Clock
-from iort_agent.ros1.json_message import Writer
+from iort_agent.ros.json_message import Writer
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake
 from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic

@@ -15,7 +15,7 @@ from typing import Any, Callable, Generator, Mapping, NamedTuple, Optional, Tupl
 
 from iort_agent.common.threads import Clock
 from iort_contract.limits import MessageError
-from iort_contract.ros1.definition import (
+from iort_contract.ros.definition import (
     DURATION,
     HEADER_TYPE,
     LETTERS,

@@ -11,9 +11,9 @@ from typing import Any, Sequence
 from iort_agent.common.schema import FILE, Place, Rule, choice, items, number, section, setting, text
 from iort_agent.common.threads import Clock, Pace
 from iort_agent.errors import SourceError
-from iort_agent.ros1 import Graph, OnBytes
-from iort_agent.ros1.json_message import decode
-from iort_agent.ros1.types import OnTrigger
+from iort_agent.ros import Graph, OnBytes
+from iort_agent.ros.json_message import decode
+from iort_agent.ros.ros1_types import OnTrigger
 from iort_agent.sources import Emit, Source, SourceConfig
 from iort_agent.sources.sim.driver import HALL, Circuit, Wish, wrapped
 from iort_agent.sources.sim.faults import FaultConfig, fault_rule
@@ -22,7 +22,7 @@ from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.commands import DRIVE_TYPE, MAX_LEASE_MS
-from iort_contract.ros1.definition import Definition, parse
+from iort_contract.ros.definition import Definition, parse
 from iort_contract.topics import check_stream
 from iort_contract.track import Track, parse_track
 

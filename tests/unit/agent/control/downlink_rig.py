@@ -18,10 +18,10 @@ from iort_agent.control.downlink import Downlink
 from iort_agent.control.leases import STOP_AHEAD_MS
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.ros1.types import OnTrigger
+from iort_agent.ros.ros1_types import OnTrigger
 from iort_contract.limits import Value
 from iort_contract.messages.commands import Command, encode_command
-from iort_contract.ros1.definition import Definition, parse
+from iort_contract.ros.definition import Definition, parse
 from testkit.agent import Loopback, ManualClock, link_of
 
 RULE = "=" * 80

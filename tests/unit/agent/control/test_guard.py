@@ -21,7 +21,7 @@ from iort_agent.control import guard as guard_module
 from iort_agent.control.guard import Guard, StopFile
 from iort_agent.control.leases import STOP_AHEAD_MS
 from iort_contract.messages.commands import NO_GUARD
-from iort_contract.ros1.definition import parse
+from iort_contract.ros.definition import parse
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import LEASE_MS, T0, FakeGuard, Rig, doubles
 

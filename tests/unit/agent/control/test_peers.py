@@ -24,7 +24,7 @@ from iort_agent.errors import UploadError
 from iort_agent.files.upload import Uploader
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import MqttMessage
-from iort_agent.ros1.json_message import encode
+from iort_agent.ros.json_message import encode
 from iort_contract.messages.commands import FleetMessage, decode_fleet, encode_fleet
 from iort_contract.messages.files import file_key
 from iort_contract.messages.questions import (
@@ -37,7 +37,7 @@ from iort_contract.messages.questions import (
     decode_ask,
     encode_answer,
 )
-from iort_contract.ros1.definition import parse
+from iort_contract.ros.definition import parse
 from testkit.agent import Loopback, ManualClock, link_of
 from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, T0, FakeGraph, Rig, doubles
 

@@ -20,12 +20,12 @@ from iort_contract.limits import MAX_PUBNUB_BYTES, MessageError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS, file_key
 from iort_contract.messages.live import LiveSample, encode_live
-from iort_contract.ros1.decode import Decoder, Large
-from iort_contract.ros1.definition import parse
-from iort_contract.ros1.message import Messages, RosMessage, RosType, filled
+from iort_contract.ros.decode import Decoder, Large
+from iort_contract.ros.definition import parse
+from iort_contract.ros.message import Messages, RosMessage, RosType, filled
 from testkit.agent import ManualClock
 from tests.images import TOPIC, jpeg, write_bag
-from tests.unit.contract.ros1.ros1_messages import HEADER, text, u32
+from tests.unit.contract.ros.ros1_messages import HEADER, text, u32
 
 T_US = 1_700_000_000_123_456
 PICTURE = jpeg()

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from iort_agent.lanes.streams import MAX_VALUES, BatchEncoder, StreamCounts, _Open
 from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES
 from iort_contract.messages.batch import Batch, RunEnd, decode_batch, messages_of
-from iort_contract.ros1.message import RosMessage, RosType
+from iort_contract.ros.message import RosMessage, RosType
 from testkit.agent import ManualClock, MemorySpool
 from tests.examples import examples
-from tests.unit.contract.ros1.ros1_messages import text
+from tests.unit.contract.ros.ros1_messages import text
 
 T0 = 1_700_000_000_000_000
 BOOT = "0123456789abcdef"

@@ -20,7 +20,7 @@ from iort_agent.sources.recording import BagConfig
 from iort_agent.sources.recording.rosbag import _VESC_STATE_ROS2, VESC_TYPE
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS
-from iort_contract.ros1.message import message_type, type_id
+from iort_contract.ros.message import message_type, type_id
 from testkit.agent import ManualClock
 from tests.recordings import recording
 

@@ -14,9 +14,9 @@ from iort_agent.errors import SourceError
 from iort_agent.sources.intake import Intake
 from iort_agent.sources.ros1 import Ros1Config, TopicConfig
 from iort_contract.catalog.streams import TYPES_STREAM
-from iort_contract.ros1.message import MessageType, RosMessage, message_type
+from iort_contract.ros.message import MessageType, RosMessage, message_type
 from testkit.agent import ManualClock
-from tests.unit.contract.ros1.ros1_messages import LINE, STAMPED, header, u32
+from tests.unit.contract.ros.ros1_messages import LINE, STAMPED, header, u32
 
 T0 = 1_700_000_000_000_000
 CONNECTION = {"type": "a_msgs/A", "md5sum": "1", "message_definition": STAMPED + "uint8 u"}

@@ -14,7 +14,7 @@ import pytest
 
 from iort_contract.codec import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
-from iort_contract.ros1.message import Messages, RosType
+from iort_contract.ros.message import Messages, RosType
 from testkit.ros1_types import Message
 from tests.messages_page import EXAMPLES, PAGE
 

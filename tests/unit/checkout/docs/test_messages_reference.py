@@ -61,7 +61,7 @@ from iort_contract.messages.questions import (
     encode_ask,
 )
 from iort_contract.messages.shadow import CHANGEABLE, decode_desired, decode_reported, encode_reported
-from iort_contract.ros1.message import MessageType, message_type
+from iort_contract.ros.message import MessageType, message_type
 from iort_contract.tables import (
     OVER_SHARE,
     PUT_OFF,

@@ -18,13 +18,13 @@ from iort_analysis.samples.blocks import join
 from iort_contract.dynamodb import starting_between
 from iort_contract.limits import MAX_BATCH_VALUES
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
-from iort_contract.ros1.message import Messages, RosType
+from iort_contract.ros.message import Messages, RosType
 from iort_contract.topics import RECORD, build_topic
 from iort_station.data.recorded import Recorded
 from testkit.dynamodb import TELEMETRY, FakeDynamoDB, item_of, item_of_message
 from tests.archived import FakeS3, archive, compact
 from tests.recordings import recording
-from tests.unit.contract.ros1.ros1_messages import text, u32
+from tests.unit.contract.ros.ros1_messages import text, u32
 from tests.unit.contract.test_codec import BOOT, WRONG, columns, enveloped, message_of
 from tests.unit.functions.summarizing import drive_of
 from tests.unit.station.data.test_queries import cloud_of

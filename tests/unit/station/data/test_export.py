@@ -23,8 +23,8 @@ from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.sources.recording import BagConfig
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.files import ATTACHMENT_FIELDS
-from iort_contract.ros1.decode import Large
-from iort_contract.ros1.message import Messages, MessageType, RosType, cut
+from iort_contract.ros.decode import Large
+from iort_contract.ros.message import Messages, MessageType, RosType, cut
 from iort_contract.topics import RECORD, build_topic
 from iort_station.data import bags
 from iort_station.data.export import Export, write
@@ -34,7 +34,7 @@ from testkit.dynamodb import TELEMETRY, item_of, item_of_message, serialize
 from testkit.ros1_types import HEADER, MESSAGES, Message, fields, header
 from tests.ros1_strategies import definitions, messages
 from tests.unit.agent.sources.test_bag import write_mcap, write_ros2
-from tests.unit.contract.ros1.ros1_messages import LINE, text, u32
+from tests.unit.contract.ros.ros1_messages import LINE, text, u32
 from tests.unit.station.data.test_queries import START, cloud_of
 
 FLAT = RosType("/flat", "a_msgs/Flat", "1", "uint8 n")

@@ -20,7 +20,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.codec import flat_second, packed_second
 from iort_contract.limits import MAX_BATCH_SPAN_US
 from iort_contract.messages.batch import Batch
-from iort_contract.ros1.message import MessageType
+from iort_contract.ros.message import MessageType
 from iort_contract.topics import build_topic
 from iort_station import data
 from iort_station.cli.verbs import samples

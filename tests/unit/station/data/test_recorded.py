@@ -22,7 +22,7 @@ from iort_analysis.samples.blocks import values
 from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
 from iort_contract.messages.account import StreamAccount
 from iort_contract.messages.batch import Batch, RunEnd
-from iort_contract.ros1.message import Messages, MessageType, RosType
+from iort_contract.ros.message import Messages, MessageType, RosType
 from iort_contract.tables import RECOMPUTE_FROM_S
 from iort_contract.topics import RECORD, build_topic
 from iort_station import data
@@ -40,7 +40,7 @@ from iort_station.upkeep.deployment import FAIL
 from testkit.dynamodb import ARCHIVE, ROBOTS, TELEMETRY, item_of, item_of_message
 from tests import archived
 from tests.archived import FakeS3, archive, compact, expire
-from tests.unit.contract.ros1.ros1_messages import text, u32
+from tests.unit.contract.ros.ros1_messages import text, u32
 from tests.unit.functions.summarizing import Stream
 from tests.unit.station.data.test_queries import FakeCloud, cloud_of
 

@@ -13,7 +13,7 @@ from iort_analysis.samples.blocks import Block, column_of
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.batch import Batch
-from iort_contract.ros1.message import MessageType, message_type
+from iort_contract.ros.message import MessageType, message_type
 from iort_contract.topics import build_topic
 from iort_station.data import bags
 from iort_station.data.ros_messages import Maker, made_of, types

@@ -24,9 +24,9 @@ from iort_contract.limits import (
     MessageError,
     Value,
 )
-from iort_contract.ros1.decode import HEADER, Decoder
-from iort_contract.ros1.definition import parse
-from iort_contract.ros1.message import MAX_LAYOUT, Messages
+from iort_contract.ros.decode import HEADER, Decoder
+from iort_contract.ros.definition import parse
+from iort_contract.ros.message import MAX_LAYOUT, Messages
 
 _NS = 1_000_000_000
 # The limit for all frame_ids of a batch; messages with longer ones are stored unchanged.

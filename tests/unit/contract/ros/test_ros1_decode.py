@@ -15,14 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.limits import MAX_FIELDS, MessageError
-from iort_contract.ros1 import decode
-from iort_contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder, stamp_ns
-from iort_contract.ros1.definition import VARIABLE, Definition, Fields, parse
+from iort_contract.ros import decode
+from iort_contract.ros.decode import MAX_ELEMENTS, MAX_TEXT, Decoder, stamp_ns
+from iort_contract.ros.definition import VARIABLE, Definition, Fields, parse
 from tests.examples import examples
 from tests.flatten import flatten
 from tests.recordings import recording
-from tests.unit.contract.ros1.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
-from tests.unit.contract.ros1.ros1_values import by_rosbags, definitions, values
+from tests.unit.contract.ros.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
+from tests.unit.contract.ros.ros1_values import by_rosbags, definitions, values
 
 
 def nested_header(path: str) -> dict[str, Any]:

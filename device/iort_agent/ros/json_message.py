@@ -16,7 +16,7 @@ from operator import itemgetter
 from typing import Any, Callable, List, Mapping, NamedTuple, Sequence, Union
 
 from iort_contract.limits import MessageError
-from iort_contract.ros1.definition import (
+from iort_contract.ros.definition import (
     DURATION,
     HEADER_TYPE,
     LETTERS,

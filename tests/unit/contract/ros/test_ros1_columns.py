@@ -24,11 +24,11 @@ from iort_contract.limits import (
     MessageError,
 )
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch, messages_of, split_batch
-from iort_contract.ros1.columns import as_columns, decoder_of, from_columns, view
-from iort_contract.ros1.decode import HEADER as HEAD
-from iort_contract.ros1.decode import Large
-from iort_contract.ros1.definition import layout, parse
-from iort_contract.ros1.message import (
+from iort_contract.ros.columns import as_columns, decoder_of, from_columns, view
+from iort_contract.ros.decode import HEADER as HEAD
+from iort_contract.ros.decode import Large
+from iort_contract.ros.definition import layout, parse
+from iort_contract.ros.message import (
     MAX_LAYOUT,
     Messages,
     MessageType,
@@ -42,7 +42,7 @@ from iort_contract.ros1.message import (
 )
 from tests.examples import examples
 from tests.unit.contract.contract_values import BOOT, json_values
-from tests.unit.contract.ros1.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
+from tests.unit.contract.ros.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
 
 T0 = 1_700_000_000_000_000
 FLAT = RosType("/flat", "a_msgs/Flat", "1", "float64 x\nfloat32 y\nint16 n\nbool on\nuint64 big")

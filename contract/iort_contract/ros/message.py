@@ -8,8 +8,8 @@ from typing import Any, Iterator, Mapping, NamedTuple, Sequence, ValuesView
 
 from iort_contract.checks import COMPACT, json_object, shown
 from iort_contract.limits import MAX_COLUMNS_BYTES, MAX_SERIALIZED_BYTES, ContractError, MessageError, Value
-from iort_contract.ros1.decode import Decoder, Large
-from iort_contract.ros1.definition import layout, parse
+from iort_contract.ros.decode import Decoder, Large
+from iort_contract.ros.definition import layout, parse
 
 # The size limit of a layout in a batch; ROS definitions have some thousand characters.
 MAX_LAYOUT = 64 * 1024

@@ -1,12 +1,12 @@
-"""The agent's own ROS 1 node, installed message types, and ROS 1 messages from and to JSON. This room uses
+"""The agent's own ROS node, installed message types, and ROS 1 messages from and to JSON. This room uses
 the tools of all rooms, and knows neither sources nor lanes."""
 
 from __future__ import annotations
 
 from typing import Callable, Mapping, Protocol
 
-from iort_agent.ros1.types import OnTrigger
-from iort_contract.ros1.definition import Definition
+from iort_agent.ros.ros1_types import OnTrigger
+from iort_contract.ros.definition import Definition
 
 # Takes a message: the publisher's connection header, and the message's bytes.
 OnBytes = Callable[[Mapping[str, str], bytes], None]
@@ -14,7 +14,7 @@ OnBytes = Callable[[Mapping[str, str], bytes], None]
 
 class Graph(Protocol):
     """A ROS graph as its users see it: topics to publish and to hear, in the messages' own bytes. No call
-    blocks. `iort_agent.ros1.node.Node` is the real one."""
+    blocks. `iort_agent.ros.ros1_node.Node` is the real one."""
 
     def definition(self, kind: str) -> Definition:
         """The definition of an installed type. Raises `SourceError` if it is not installed."""

@@ -22,10 +22,10 @@ from typing import Any, Mapping, Sequence
 
 from iort_agent.common.threads import Clock, Supervised, SystemClock
 from iort_agent.errors import SourceError
-from iort_agent.ros1 import OnBytes, master
-from iort_agent.ros1.types import Installed, OnTrigger, installed, rospy, trigger
+from iort_agent.ros import OnBytes, ros1_master
+from iort_agent.ros.ros1_types import Installed, OnTrigger, installed, rospy, trigger
 from iort_contract.limits import MessageError
-from iort_contract.ros1.definition import Definition, parse
+from iort_contract.ros.definition import Definition, parse
 
 _log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ class Node:
         }
         self._uri: str = importlib.import_module("rosgraph").get_master_uri()
         try:
-            self._master = master.Master(self._uri, self._me)
+            self._master = ros1_master.Master(self._uri, self._me)
         except OSError as error:
             raise SourceError(f"ROS_MASTER_URI is {self._uri!r}: {error}") from error
         self._thread = Supervised("ros1 node", self._run)
@@ -209,8 +209,8 @@ class Node:
         """Whether a node of this name, in our namespace, is in the graph and answers."""
         name = self._me[: -len(self.base)] + base
         try:
-            uri = master.Master(self._uri, self._me).ask("lookupNode", name)
-        except master.ERRORS:
+            uri = ros1_master.Master(self._uri, self._me).ask("lookupNode", name)
+        except ros1_master.ERRORS:
             return False
         return self._answers(uri, name)
 
@@ -271,7 +271,7 @@ class Node:
         while not self._stop.is_set():
             try:
                 self._holder = self._living_namesake()
-            except master.ERRORS:
+            except ros1_master.ERRORS:
                 self._clock.wait(self._stop, _WAIT_S)
                 self._await_master()
                 continue
@@ -296,10 +296,10 @@ class Node:
 
     def _answers(self, uri: str, name: str | None = None) -> bool:
         try:
-            status, _, told = master.proxy(uri).getName(self._me)
+            status, _, told = ros1_master.proxy(uri).getName(self._me)
         except xmlrpc.client.Fault:
             return True  # only rospy's nodes tell their names
-        except master.ERRORS:
+        except ros1_master.ERRORS:
             return False
         # Another node may have the port by now.
         return bool(status == 1 and told == (name or self._me))
@@ -327,7 +327,7 @@ class Node:
         for name, level in _LOGGERS.items():
             logging.getLogger(name).setLevel(level)
         rospy.core.add_preshutdown_hook(self._on_shutdown)
-        master.mend(self._me)
+        ros1_master.mend(self._me)
         _read_directly(self._handlers)
         # The agent handles signals, names are resolved already, and /clock is of no use to the agent.
         rospy.init_node(
@@ -386,7 +386,7 @@ class Node:
                 return
             self._register_again(dict(publishers), dict(subscribers), dict(services))
             self._connect(dict(publishers))
-        except master.ERRORS as error:
+        except ros1_master.ERRORS as error:
             if not self._absent:
                 _log.warning("the ROS master at %s does not answer: %s", self._uri, error)
             self._absent = True
@@ -425,7 +425,7 @@ class Node:
     def _tell(self, topic: str, uris: list[str]) -> None:
         """Tell rospy of a topic's publishers as a master does: it connects to the unknown ones."""
         if uris:
-            master.proxy(self._rospy.get_node_uri()).publisherUpdate("/master", topic, uris)
+            ros1_master.proxy(self._rospy.get_node_uri()).publisherUpdate("/master", topic, uris)
 
 
 def _read_directly(handlers: Mapping[str, Sequence[OnBytes]]) -> None:

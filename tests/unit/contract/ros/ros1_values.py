@@ -8,7 +8,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from iort_contract.ros1.definition import DURATION, LETTERS, STRING, TIME, Definition, Field, parse
+from iort_contract.ros.definition import DURATION, LETTERS, STRING, TIME, Definition, Field, parse
 
 RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"

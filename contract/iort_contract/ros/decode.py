@@ -20,7 +20,7 @@ from itertools import islice
 from typing import Callable, Dict, Iterator, NamedTuple, Sequence, Tuple, Union
 
 from iort_contract.limits import MAX_FIELDS, MessageError, Value
-from iort_contract.ros1.definition import LETTERS, STRING, VARIABLE, Definition, Field, Fields
+from iort_contract.ros.definition import LETTERS, STRING, VARIABLE, Definition, Field, Fields
 
 MAX_TEXT = 4096
 # A message with more elements of variable size in one array is not decoded.
