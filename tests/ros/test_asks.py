@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from tests.ros.conftest import Graph, Process
+from tests.ros.conftest import Graph
+from tests.ros.process import Process
 
 
 def start(graph: Graph, **ask: Any) -> tuple[Process, Process]:

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 
 from testkit.waiting import until
-from tests.ros.conftest import Graph, Process
+from tests.ros.conftest import Graph
+from tests.ros.process import Process
 
 CONFIG = {
     "downlink": {

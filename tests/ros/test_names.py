@@ -6,22 +6,16 @@ import json
 import xmlrpc.client
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import yaml
-
-from iort_agent.errors import AgentError
-from iort_agent.status import fetch
 from testkit.waiting import until
-from tests.local.faults.test_uplink import self_signed
-from tests.ros.conftest import Graph, Process
+from tests.ros.agents import agent_of
+from tests.ros.conftest import Graph
+from tests.ros.process import WAIT_S, Process
 from tests.ros.test_downlink import connected, drive, has, start
 from tests.ros.test_source import Cars, turns, until_turns
-from tests.unit.agent.test_agent import config_file
 
 WAITS = "another node is called /iort_agent at http://127.0.0.1:"
 WHEELS = {"type": "ros1", "topics": {"/wheel": {"stream": "wheel", "time": "header"}}}
-WAIT_S = 120
 
 
 def test_a_second_node_waits_until_the_first_has_ended(graph: Graph) -> None:
@@ -133,43 +127,6 @@ def test_commands_and_shares_are_remapped(graph: Graph) -> None:
 
 def newest(*collectors: Process) -> int:
     return max(turn for one in collectors for turn in [-1, *turns(one)])
-
-
-def agent_of(graph: Graph, folder: Path, *sources: dict[str, Any], arguments: tuple[str, ...] = ()) -> Agent:
-    """Return the real agent in a graph, without a reachable broker."""
-    text = yaml.safe_dump(list(sources), default_flow_style=True, width=1000).strip()[1:-1]
-    config = config_file(folder, text, "queue: {path: queue.db}\nport: 1")
-    self_signed(folder)
-    for made, named in (("private.key", "key.pem"), ("certificate.pem", "cert.pem")):
-        (folder / made).replace(folder / named)
-    (folder / "ca.pem").write_bytes((folder / "cert.pem").read_bytes())
-    command = ("iort_agent.cli", "run", "--config", config, "--drain-s", 0, *arguments)
-    return Agent(graph.module(*map(str, command)), folder)
-
-
-class Agent(NamedTuple):
-    process: Process
-    folder: Path
-
-    def status(self) -> dict[str, Any]:
-        assert self.process.alive(), "\n".join(self.process.errors)
-        try:
-            return fetch(self.folder / "agent.sock")
-        except AgentError:
-            return {}  # no status yet
-
-    def waits(self) -> list[str] | None:
-        """Return the alarms of waiting sources; None without a status."""
-        alarms = self.status().get("alarms")
-        return None if alarms is None else [one for one in alarms if one.startswith("source waits")]
-
-    def topic(self, name: str) -> dict[str, Any]:
-        """Return the counts of a topic of the first source."""
-        counts: dict[str, Any] = self.status().get("sources", [{}])[0].get(name, {})
-        return counts
-
-    def samples(self, stream: str) -> int:
-        return int(self.status().get("streams", {}).get(stream, {}).get("samples", 0))
 
 
 def said(process: Process, text: str) -> int:

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from testkit.waiting import until
-from tests.ros.conftest import Graph, Process
-from tests.ros.test_names import WAIT_S, agent_of
+from tests.ros.agents import agent_of
+from tests.ros.conftest import Graph
+from tests.ros.process import WAIT_S, Process
 from tests.ros.test_source import WHEEL
 
 

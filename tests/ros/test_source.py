@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from tests.ros.conftest import Graph, Process
+from tests.ros.conftest import Graph
+from tests.ros.process import Process
 
 RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"

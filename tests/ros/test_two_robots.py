@@ -16,7 +16,8 @@ from iort_contract.topics import CMD, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import bundle, embedded, iort  # noqa: F401 - fixtures
-from tests.ros.conftest import Graph, Process
+from tests.ros.conftest import Graph
+from tests.ros.process import Process
 from tests.unit.agent.control.downlink_rig import POSE
 
 POSE_TYPE = "geometry_msgs/PoseStamped"

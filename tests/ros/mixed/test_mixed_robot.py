@@ -29,9 +29,10 @@ from local.cloud import EmbeddedCloud
 from testkit.proxy import PASS, REFUSE, Proxy
 from testkit.waiting import until
 from tests.local.conftest import embedded, iort  # noqa: F401 - fixtures
-from tests.ros.conftest import Graph, Process, ros_python  # noqa: F401 - a fixture
+from tests.ros.conftest import Graph, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed.compare import Bag, Difference, Recorded, compare, read
 from tests.ros.mixed.robot import NODES, TOPICS
+from tests.ros.process import Process
 
 pytestmark = pytest.mark.heavy
 

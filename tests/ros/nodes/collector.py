@@ -1,8 +1,8 @@
-"""The agent's ros1 source alone, in its own process; each sample is a line of JSON on standard output.
+"""A source of the agent alone, in its own process; each sample is a line of JSON on standard output.
 
 A line has stream, time and values, then the message's bytes. Usage:
-``collector.py CONFIG.json`` with the source's settings; ``quit`` on standard input ends it, and the last
-line is the source's report.
+``collector.py CONFIG.json`` with the source's settings, and its ``type`` unless it is ``ros1``; ``quit`` on
+standard input ends it, and the last line is the source's report.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from pathlib import Path
 
 from iort_agent.common.schema import Place, load
 from iort_agent.common.threads import SystemClock
-from iort_agent.sources.ros1 import Ros1Config
+from iort_agent.sources.registry import SOURCES
 from iort_contract.ros.message import RosMessage
 from tests.ros.nodes import say
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
 file = Path(sys.argv[1])
-config = load(Ros1Config, json.loads(file.read_text()), Place(file))
+settings = json.loads(file.read_text())
+config = load(SOURCES[settings.pop("type", "ros1")], settings, Place(file))
 source, stop = config.build(SystemClock()), threading.Event()
 
 

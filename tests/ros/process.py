@@ -1,0 +1,120 @@
+"""A child process of a test, whose output is read as it comes."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from testkit import ROOT
+
+WAIT_S = 120.0
+
+
+class Process:
+    """A child whose output is read as it comes; the input line `quit` asks it to end."""
+
+    def __init__(self, command: list[str], environment: dict[str, str]) -> None:
+        self._process = subprocess.Popen(
+            command,
+            env=environment,
+            cwd=ROOT,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        self.pid = self._process.pid
+        self.lines: list[str] = []
+        self.errors: list[str] = []
+        self._news = threading.Condition()
+        self._unread = 2  # streams
+        self._readers = [
+            threading.Thread(target=self._read, args=(stream, lines), daemon=True)
+            for stream, lines in ((self._process.stdout, self.lines), (self._process.stderr, self.errors))
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def _read(self, stream: Any, lines: list[str]) -> None:
+        for line in stream:
+            with self._news:
+                lines.append(line.rstrip("\n"))
+                self._news.notify_all()
+        with self._news:
+            self._unread -= 1
+            self._news.notify_all()
+
+    def until(self, condition: Callable[[], Any], what: str) -> Any:
+        """Wait for output that makes the condition true."""
+        found = self.within(WAIT_S, condition)
+        assert found, f"no {what}; {self.lines[-3:]}\n" + "\n".join(self.errors[-25:])
+        return found
+
+    def within(self, seconds: float, condition: Callable[[], Any]) -> Any:
+        """Wait for output that makes the condition true, but no longer than that."""
+        with self._news:
+            # A process that has ended may have written more than is read yet.
+            self._news.wait_for(lambda: condition() or not self._unread, seconds)
+            return condition()
+
+    def alive(self) -> bool:
+        """Whether it still runs."""
+        return self._process.poll() is None
+
+    def until_said(self, text: str) -> None:
+        """Wait for a text in the log."""
+        self.until(lambda: any(text in line for line in self.errors), f"{text!r} in its log")
+
+    def say(self, line: str) -> None:
+        """Write a line on its input."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{line}\n")
+        self._process.stdin.flush()
+
+    def quit(self) -> list[str]:
+        """Ask it to end; return all lines of its output."""
+        if self._process.poll() is None:
+            self.say("quit")
+        assert self._process.wait(WAIT_S) == 0, "\n".join(self.errors[-25:])
+        for reader in self._readers:
+            reader.join(WAIT_S)
+        return self.lines
+
+    def wait(self) -> None:
+        """Wait until it ends by itself, without error."""
+        assert self.ended() == 0, "\n".join(self.errors[-25:])
+
+    def terminate(self) -> int:
+        """End it as a supervisor does; return its status."""
+        self._process.terminate()
+        return self.ended()
+
+    def ended(self) -> int:
+        """Wait until it ends by itself; return its status."""
+        status = self._process.wait(WAIT_S)
+        for reader in self._readers:
+            reader.join(WAIT_S)
+        return status
+
+    def interrupt(self) -> None:
+        """End it as Ctrl-C does."""
+        self._process.send_signal(signal.SIGINT)
+        self.wait()
+
+    def signal(self, number: int) -> None:
+        """Send it a signal."""
+        self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """End it at once."""
+        self._process.kill()
+        self._process.wait()
+        for reader in self._readers:
+            reader.join(WAIT_S)
+        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
+            if stream is not None:
+                stream.close()
