@@ -94,6 +94,7 @@ THREADS = {
     "record": Kind(longest_s=1.0),
     # rospy cannot be begun anew in the middle of anything.
     "ros1 node": Kind(END),
+    "ros2 node": Kind(END),
     "source": Kind(),
     "spool": Kind(longest_s=1.0),
     "status": Kind(),

@@ -27,6 +27,7 @@ from iort_agent.lanes import PingConfig
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.client import Broker
 from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.ros import ros2_node as ros2_module
 from iort_agent.ros.ros1_node import Node
 from iort_agent.runtime import Runtime
 from iort_agent.sources.sim import SimConfig
@@ -181,6 +182,19 @@ def ros1_node(kind: str, _folder: Path, patch: pytest.MonkeyPatch) -> None:
     node._thread.join(SOON_S)
 
 
+def ros2_node(kind: str, _folder: Path, _patch: pytest.MonkeyPatch) -> None:
+    """The process ends."""
+    ended = threading.Event()
+    WATCH.on_end(ended.set)
+    node = ros2_module.Node("iort_agent", lambda _: surprise(), Trap("nobody"))
+    node.users = 1
+    node.start()
+    assert ended.wait(SOON_S)
+    assert "so the agent ends" in alarms(kind)[0]
+    assert node.failed == f"the ROS node iort_agent has ended: {WHY}"
+    node._thread.join(SOON_S)
+
+
 def status(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> None:
     """It answers the next question."""
     server = StatusServer(folder / "agent.sock", lambda: {"alarms": alarms(kind) or surprise()})
@@ -221,6 +235,7 @@ SCENARIOS: dict[str, Scenario] = {
     "asks": asks,
     "guard": guard,
     "ros1 node": ros1_node,
+    "ros2 node": ros2_node,
     "status": status,
     "uplink": uplink,
 }
