@@ -20,6 +20,8 @@ from iort_agent.common.schema import did_you_mean
 from iort_agent.common.threads import SystemClock
 from iort_agent.config import Config, load_config, without_sources
 from iort_agent.errors import AgentError, ConfigError
+from iort_agent.ros.arguments import CONFIG, LOG_LEVEL, is_remapping, split
+from iort_agent.ros.ros1_node import DEFAULT_NODE
 from iort_agent.runtime import Runtime, make_uplink
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import SOCKET, StatusServer, ask, fetch
@@ -30,18 +32,16 @@ _log = logging.getLogger("iort-agent")
 
 # A terminal signals the whole process group, and a supervisor passes it on: the two count as one.
 _SAME_SIGNAL_S = 1.0
-# ROS' NAME:=VALUE, which roslaunch adds to every command. A name with one underscore is a parameter.
-_REMAPPING = re.compile(r"(?:~|/|[A-Za-z]|__?)[\w/]*:=(?!.*:=).*", re.ASCII)
-_PARAMETER = re.compile(r"_[^_]")
 _NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command. Returns the exit status: 0 good, 1 something failed or was lost, 2 wrong use."""
-    options = _parse(list(sys.argv[1:] if arguments is None else arguments))
     # Only the user may read what a command writes, until the user allows more.
     before = os.umask(0o077)
+    options = argparse.Namespace(command=None)
     try:
+        options = _parse(list(sys.argv[1:] if arguments is None else arguments))
         status: int = options.command(options)
         sys.stdout.flush()
     except ConfigError as error:
@@ -125,18 +125,19 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         parser.print_help(sys.stderr)
         raise SystemExit(2)
     first = arguments[0]
-    if first not in ("-h", "--help", "--version") and (first.startswith("-") or _REMAPPING.fullmatch(first)):
+    ignored: list[str] = []
+    if first not in ("-h", "--help", "--version") and (first.startswith("-") or is_remapping(first)):
         arguments = ["run", *arguments]
-    remappings = []
-    if arguments and arguments[0] == "run":
-        # The ROS node reads them from sys.argv, as every ROS node does.
-        remappings = [argument for argument in arguments if _REMAPPING.fullmatch(argument)]
-        arguments = [argument for argument in arguments if argument not in remappings]
+    if arguments[0] == "run":
+        arguments, parameters, ignored = split(arguments, DEFAULT_NODE)
+        # As options of the command line, which has the last word.
+        given = [(name, parameters[name]) for name in (CONFIG, LOG_LEVEL) if parameters.get(name)]
+        arguments[1:1] = [text for name, value in given for text in (f"--{name.replace('_', '-')}", value)]
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         names = [f"--{name}".replace("_", "-") for name in vars(options) if name != "command"]
         parser.error(f"unrecognized arguments: {' '.join(unknown)}{did_you_mean(unknown[0], names)}")
-    options.ignored = [argument for argument in remappings if _PARAMETER.match(argument)]
+    options.ignored = ignored
     return options
 
 
@@ -157,8 +158,7 @@ def run(options: argparse.Namespace) -> int:
         config = dataclasses.replace(config, log_level=options.log_level)
     troubles = set_up(config.log_level)
     for argument in options.ignored:
-        _log.warning("%s is ignored: the agent has no ROS parameters, %s has its settings", argument,
-                     options.config)  # fmt: skip
+        _log.warning("%s is ignored: %s has the agent's settings", argument, options.config)
     status, agent = _run(config, options, troubles)
     report = make_status(agent)
     if options.report is not None:
