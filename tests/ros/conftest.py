@@ -6,6 +6,7 @@ Debian's Python.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -37,8 +38,18 @@ def ros_python() -> str:
     return python_with_rospy()
 
 
+def downlink(python: str, folder: Path, settings: object, *arguments: str) -> list[str]:
+    """The command that runs an agent's downlink alone."""
+    file = folder / "downlink.json"
+    file.write_text(json.dumps(settings))
+    return [python, str(SCRIPTS / "downlinks.py"), str(file), *arguments]
+
+
 class Graph:
-    """A ROS graph of its own: master, environment, and the processes in it."""
+    """A ROS graph of its own: master, environment, and the processes in it. Tests that hold in either ROS use
+    what it has in common with tests/ros2's."""
+
+    ros = 1
 
     def __init__(self, python: str, folder: Path) -> None:
         self.python, self.folder = python, folder
@@ -56,6 +67,14 @@ class Graph:
 
     def module(self, module: str, *arguments: object) -> Process:
         return self.start([self.python, "-m", module, *map(str, arguments)])
+
+    def listener(self, name: str, topic: str, kind: str) -> Process:
+        """Run a foreign subscriber, whose lines are ``connected``, then ``[time, message]``."""
+        return self.run("listener.py", name, topic, kind)
+
+    def downlink(self, settings: object, *arguments: str) -> Process:
+        """Run the agent's downlink alone; see nodes/downlinks.py."""
+        return self.start(downlink(self.python, self.folder, settings, *arguments))
 
     def parameter(self, name: str, value: Any) -> None:
         with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"], allow_none=True) as proxy:

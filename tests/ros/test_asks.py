@@ -1,19 +1,23 @@
-"""A ROS node asks the cloud by a service and by a topic, of the real graph."""
+"""A ROS node asks the cloud by a service and by a topic, of the real graph.
+
+What takes an `AnyGraph` also runs in ROS 2, from tests/ros2/test_asks.py.
+"""
 
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tests.ros.conftest import Graph
 from tests.ros.process import Process
 
+if TYPE_CHECKING:
+    from tests.ros.test_downlink import AnyGraph
 
-def start(graph: Graph, **ask: Any) -> tuple[Process, Process]:
+
+def start(graph: AnyGraph, **ask: Any) -> tuple[Process, Process]:
     """The agent's downlink, and a node that has found its service."""
-    file = graph.folder / "asks.json"
-    file.write_text(json.dumps({"downlink": {"ask": {"calibration": ask}}}))
-    downlink = graph.run("downlinks.py", file)
+    downlink = graph.downlink({"downlink": {"ask": {"calibration": ask}}})
     caller = graph.run("caller.py", "planner", "calibration")
     caller.until(lambda: "found" in caller.lines, "service")
     return downlink, caller
@@ -24,20 +28,20 @@ def answers(caller: Process, count: int) -> list[Any]:
     return [json.loads(line) for line in caller.lines[1:]]
 
 
-def test_a_node_calls_the_service_and_gets_the_answer(graph: Graph) -> None:
+def test_a_node_calls_the_service_and_gets_the_answer(graph: AnyGraph) -> None:
     _, caller = start(graph, body={"last": 1})
     caller.say("")
     ((success, message),) = answers(caller, 1)
     assert (success, json.loads(message)) == (True, {"asked": {"last": 1}})
 
 
-def test_a_refusal_is_no_success_and_says_why(graph: Graph) -> None:
+def test_a_refusal_is_no_success_and_says_why(graph: AnyGraph) -> None:
     _, caller = start(graph)
     caller.say("")
     assert answers(caller, 1) == [[False, "no_data: nothing yet"]]
 
 
-def test_a_topic_takes_bodies_and_another_has_the_answers(graph: Graph) -> None:
+def test_a_topic_takes_bodies_and_another_has_the_answers(graph: AnyGraph) -> None:
     downlink, caller = start(graph)
     caller.say('{"last": 2}')
     assert answers(caller, 1) == [{"body": {"asked": {"last": 2}}}]

@@ -1,4 +1,7 @@
-"""From the broker to real ROS topics: commands, their leases, and another robot's pose."""
+"""From the broker to real ROS topics: commands, their leases, and another robot's pose.
+
+What takes an `AnyGraph` also runs in ROS 2, from tests/ros2/test_downlink.py.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import signal
 import time
 import xmlrpc.client
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -17,39 +20,41 @@ from testkit.waiting import until
 from tests.ros.conftest import Graph
 from tests.ros.process import Process
 
-CONFIG = {
-    "downlink": {
-        "cmd": {
-            "drive": {
-                "topic": "/cmd_vel",
-                "type": "geometry_msgs/TwistStamped",
-                "partial": True,
-                "motion": {"lease_s": 10, "stop": {"twist": {"linear": {"x": 0.0}}}},
-            }
-        },
-        "fleet": {"pose": {"topic": "/fleet/{robot}/pose", "type": "geometry_msgs/PoseStamped"}},
-    },
-    "share": {"/pose": {"name": "pose", "rate_hz": 20}},
-}
+if TYPE_CHECKING:
+    from tests.ros2 import conftest as ros2
+
+    AnyGraph = Graph | ros2.Graph
+
+# The types in either ROS.
+TWIST = {1: "geometry_msgs/TwistStamped", 2: "geometry_msgs/msg/TwistStamped"}
+POSE_TYPE = {1: "geometry_msgs/PoseStamped", 2: "geometry_msgs/msg/PoseStamped"}
 POSE = {"pose": {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}}
 
 
-def start(graph: Graph, *arguments: str) -> Process:
-    file = graph.folder / "downlink.json"
-    file.write_text(json.dumps(CONFIG))
-    process = graph.run("downlinks.py", file, *arguments)
+def start(graph: AnyGraph, *arguments: str) -> Process:
+    stop = {"twist": {"linear": {"x": 0.0}}}
+    drive = {"topic": "/cmd_vel", "type": TWIST[graph.ros], "partial": True}
+    settings = {
+        "downlink": {
+            "cmd": {"drive": {**drive, "motion": {"lease_s": 10, "stop": stop}}},
+            "fleet": {"pose": {"topic": "/fleet/{robot}/pose", "type": POSE_TYPE[graph.ros]}},
+        },
+        "share": {"/pose": {"name": "pose", "rate_hz": 20}},
+    }
+    process = graph.downlink(settings, *arguments)
     process.until(lambda: "started" in process.lines, "start")
     return process
 
 
 def heard(listener: Process) -> list[tuple[float, dict[str, Any]]]:
-    lines = [line for line in listener.lines if line != "connected"]
+    lines = [line for line in listener.lines if line.startswith("[")]
     return [(at, message) for at, message in map(json.loads, lines)]
 
 
 def stamp(message: dict[str, Any]) -> float:
-    at = message["header"]["stamp"]
-    return float(at["secs"] + at["nsecs"] / 1e9)
+    """The time of a message of either ROS."""
+    sec, nanosec = message["header"]["stamp"].values()
+    return float(sec + nanosec / 1e9)
 
 
 def has(listener: Process, speed: float) -> bool:
@@ -61,10 +66,11 @@ def speeds(listener: Process) -> list[float]:
 
 
 @pytest.fixture
-def driven(graph: Graph) -> tuple[Process, Process]:
+def driven(graph: AnyGraph) -> tuple[Process, Process]:
     downlink = start(graph)
-    listener = graph.run("listener.py", "driver", "/cmd_vel", "geometry_msgs/TwistStamped")
+    listener = graph.listener("driver", "/cmd_vel", TWIST[graph.ros])
     connected(downlink)
+    listener.until(lambda: "connected" in listener.lines, "connection")
     return downlink, listener
 
 
@@ -78,7 +84,7 @@ def drive(downlink: Process, x: float, lease_ms: int = 2_000) -> None:
     downlink.say(f"send {lease_ms} " + json.dumps({"twist": {"linear": {"x": x}}}))
 
 
-def guarded(graph: Graph) -> tuple[Process, Process]:
+def guarded(graph: AnyGraph) -> tuple[Process, Process]:
     """Return a robot with a guard, and a listener that hears both.
 
     The guard comes first: rospy may connect a subscriber twice, and lose a message, if a second publisher
@@ -87,12 +93,15 @@ def guarded(graph: Graph) -> tuple[Process, Process]:
     downlink = start(graph, "--guard")
     downlink.say("guard")
     downlink.until(lambda: "guarded" in downlink.lines, "guard")
-    listener = graph.run("listener.py", "driver", "/cmd_vel", "geometry_msgs/TwistStamped")
+    listener = graph.listener("driver", "/cmd_vel", TWIST[graph.ros])
     connected(downlink)
-    with xmlrpc.client.ServerProxy(graph.environment["ROS_MASTER_URI"]) as master:
-        _, _, uri = master.lookupNode("/test", "/iort_agent_guard")
-    with xmlrpc.client.ServerProxy(uri) as guard:
-        until(lambda: any(one[4] == "/cmd_vel" for one in guard.getBusInfo("/test")[2]))
+    if isinstance(graph, Graph):
+        with xmlrpc.client.ServerProxy(graph.environment["ROS_MASTER_URI"]) as master:
+            _, _, uri = master.lookupNode("/test", "/iort_agent_guard")
+        with xmlrpc.client.ServerProxy(uri) as guard:
+            until(lambda: any(one[4] == "/cmd_vel" for one in guard.getBusInfo("/test")[2]))
+    else:
+        listener.until(lambda: "publishers 2" in listener.lines, "connection to agent and guard")
     return downlink, listener
 
 
@@ -114,7 +123,7 @@ def test_a_command_is_published_and_its_lease_ends_in_stops(driven: tuple[Proces
     listener.until(lambda: len(speeds(listener)) == 6, "command and five stops")
     assert speeds(listener) == [1.5, 0, 0, 0, 0, 0]
     came, stop = heard(listener)[1]
-    assert int(sent) <= stop["header"]["stamp"]["secs"] <= came
+    assert int(sent) <= stamp(stop) <= came
 
 
 def test_a_renewed_lease_does_not_end(driven: tuple[Process, Process]) -> None:
@@ -139,7 +148,7 @@ def test_a_lost_connection_or_the_agents_end_stops_the_car(driven: tuple[Process
 
 @pytest.mark.parametrize(("end", "lease_s"), [(signal.SIGKILL, 10), (signal.SIGSTOP, 5)])
 def test_a_killed_and_a_frozen_agent_are_stopped_by_the_guard(
-    graph: Graph, end: signal.Signals, lease_s: int
+    graph: AnyGraph, end: signal.Signals, lease_s: int
 ) -> None:
     downlink, listener = guarded(graph)
     drive_on(downlink, listener, 1.5, lease_s * 1000)
@@ -156,7 +165,7 @@ def test_a_killed_and_a_frozen_agent_are_stopped_by_the_guard(
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
-def test_an_emergency_stop_outlives_a_killed_and_a_frozen_agent(graph: Graph, end: signal.Signals) -> None:
+def test_an_emergency_stop_outlives_a_killed_and_a_frozen_agent(graph: AnyGraph, end: signal.Signals) -> None:
     downlink, listener = guarded(graph)
     downlink.say("stop")
     listener.until(lambda: has(listener, 0), "the stop")
@@ -176,16 +185,18 @@ def test_an_emergency_stop_outlives_a_killed_and_a_frozen_agent(graph: Graph, en
     assert set(speeds(listener)) == {0}
 
 
-def test_a_guard_that_dies_is_started_again_and_nothing_moves_meanwhile(graph: Graph) -> None:
+def test_a_guard_that_dies_is_started_again_and_nothing_moves_meanwhile(graph: AnyGraph) -> None:
     downlink, listener = guarded(graph)
     (child,) = Path(f"/proc/{downlink.pid}/task/{downlink.pid}/children").read_text().split()
-    # The next guard cannot join before the test has seen the refusal.
-    graph.master.signal(signal.SIGSTOP)
+    if isinstance(graph, Graph):
+        # The next guard cannot join before the test has seen the refusal. In ROS 2 it takes a second.
+        graph.master.signal(signal.SIGSTOP)
     os.kill(int(child), signal.SIGKILL)
     downlink.until_said("the guard died: motion is refused until it runs again")
     drive(downlink, 0.5)
     downlink.until_said("rejected: guard not ready")
-    graph.master.signal(signal.SIGCONT)
+    if isinstance(graph, Graph):
+        graph.master.signal(signal.SIGCONT)
     downlink.say("guard")
     downlink.until(lambda: downlink.lines.count("guarded") == 2, "guard")
     drive_on(downlink, listener, 1.5, 2_000)
@@ -201,11 +212,26 @@ def test_an_invalid_message_is_rejected(driven: tuple[Process, Process]) -> None
     assert speeds(listener)[0] == 2.5
 
 
-def test_another_robots_pose_appears_as_a_topic(graph: Graph) -> None:
+def test_a_command_is_not_kept_for_a_late_subscriber(
+    graph: AnyGraph, driven: tuple[Process, Process]
+) -> None:
+    downlink, listener = driven
+    drive(downlink, 1.5)
+    listener.until(lambda: has(listener, 1.5), "command")
+    late = graph.listener("late", "/cmd_vel", TWIST[graph.ros])
+    connected(downlink, count=2)
+    late.until(lambda: "connected" in late.lines, "connection")
+    drive(downlink, 2.5)
+    late.until(lambda: has(late, 2.5), "command")
+    assert 1.5 not in speeds(late)
+
+
+def test_another_robots_pose_appears_as_a_topic(graph: AnyGraph) -> None:
     downlink = start(graph)
     downlink.say("pose car-2 " + json.dumps(POSE))
-    listener = graph.run("listener.py", "map", "/fleet/car_2/pose", "geometry_msgs/PoseStamped")
+    listener = graph.listener("map", "/fleet/car_2/pose", POSE_TYPE[graph.ros])
     connected(downlink, "/fleet/car_2/pose")
+    listener.until(lambda: "connected" in listener.lines, "connection")
     downlink.say("pose car-2 " + json.dumps(POSE))
     listener.until(lambda: heard(listener), "pose")
     assert heard(listener)[0][1]["pose"]["position"] == {"x": 1, "y": 2, "z": 3}
@@ -219,7 +245,7 @@ def test_commands_still_arrive_after_a_restart_of_the_master(
     downlink.until_said("does not answer")
     graph.start_master()
     downlink.until_said("had forgotten /pose, /cmd_vel: registered again")
-    second = graph.run("listener.py", "another", "/cmd_vel", "geometry_msgs/TwistStamped")
+    second = graph.listener("another", "/cmd_vel", TWIST[1])
     connected(downlink, count=2)
     drive(downlink, 1.5)
     for listener in (first, second):

@@ -1,4 +1,7 @@
-"""Two robots with a ROS graph each share poses and receive commands through the cloud."""
+"""Two robots with a ROS graph each share poses and receive commands through the cloud.
+
+tests/ros2/test_two_robots.py runs it in ROS 2.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -18,14 +21,17 @@ from local.cloud import EmbeddedCloud
 from tests.local.conftest import bundle, embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph
 from tests.ros.process import Process
+from tests.ros.test_downlink import POSE_TYPE
 from tests.unit.agent.control.downlink_rig import POSE
 
-POSE_TYPE = "geometry_msgs/PoseStamped"
+if TYPE_CHECKING:
+    from tests.ros.test_downlink import AnyGraph
+
+SPEED_TYPE = {1: "std_msgs/Float64", 2: "std_msgs/msg/Float64"}
 # Between the poses of the robots, which count up.
 FAR = 1_000_000
 DRIVE = {
     "topic": "/speed",
-    "type": "std_msgs/Float64",
     "max_age_s": 60,
     "motion": {"lease_s": 2, "stop": {"data": 0.0}},
 }
@@ -46,6 +52,18 @@ def graphs(ros_python: str, tmp_path: Path) -> Iterator[list[Graph]]:
             graph.stop()
 
 
+def publish_poses(graph: AnyGraph, start: int) -> None:
+    """Poses whose x counts up from a start."""
+    if isinstance(graph, Graph):
+        text = graph.folder / "pose.msg"
+        text.write_text(POSE)
+        graph.run(
+            "publisher.py", "pub", "/pose", POSE_TYPE[1], text, "--field", "pose.position.x", "--start", start
+        )
+    else:
+        graph.publisher("pub", "/pose", POSE_TYPE[2], field="pose.position.x", start=start)
+
+
 def some(listener: Process) -> bool:
     return len(messages(listener)) > 5
 
@@ -58,14 +76,16 @@ def test_two_robots_exchange_poses_and_receive_commands(
     embedded: EmbeddedCloud,  # noqa: F811 - the fixture
     bundle: Callable[..., robots.Bundle],  # noqa: F811 - the fixture
     iort: Callable[..., Any],  # noqa: F811 - the fixture
-    graphs: list[Graph],
+    graphs: list[AnyGraph],
 ) -> None:
+    ros = graphs[0].ros
+    pose_type, speed_type = POSE_TYPE[ros], SPEED_TYPE[ros]
     settings = {
-        "sources": [{"type": "ros1", "topics": {"/pose": {"stream": "pose", "time": "header"}}}],
+        "sources": [{"type": f"ros{ros}", "topics": {"/pose": {"stream": "pose", "time": "header"}}}],
         "share": {"/pose": {"name": "pose", "rate_hz": 10}},
         "downlink": {
-            "cmd": {"drive": DRIVE},
-            "fleet": {"pose": {"topic": "/fleet/{robot}/pose", "type": POSE_TYPE}},
+            "cmd": {"drive": {**DRIVE, "type": speed_type}},
+            "fleet": {"pose": {"topic": "/fleet/{robot}/pose", "type": pose_type}},
         },
     }
     cars = [bundle(name, **settings) for name in ("-a", "-b")]
@@ -74,14 +94,9 @@ def test_two_robots_exchange_poses_and_receive_commands(
         for graph, car in zip(graphs, cars, strict=True)
     ]
     for i, graph in enumerate(graphs):
-        text = graph.folder / "pose.msg"
-        text.write_text(POSE)
-        graph.run(
-            "publisher.py", "pub", "/pose", POSE_TYPE, text, "--field", "pose.position.x", "--start",
-            FAR * (i + 1),
-        )  # fmt: skip
+        publish_poses(graph, FAR * (i + 1))
     listeners = [
-        graph.run("listener.py", "map", f"/fleet/{other.robot.replace('-', '_')}/pose", POSE_TYPE)
+        graph.listener("map", f"/fleet/{other.robot.replace('-', '_')}/pose", pose_type)
         for graph, other in zip(graphs, reversed(cars), strict=True)
     ]
     for listener, agent, other in zip(listeners, agents, (2, 1), strict=True):
@@ -90,7 +105,7 @@ def test_two_robots_exchange_poses_and_receive_commands(
         assert {m["pose"]["position"]["x"] // FAR for m in messages(listener)} == {other}
 
     # The operator drives one of them, then stops sending.
-    driver = graphs[0].run("listener.py", "driver", "/speed", "std_msgs/Float64")
+    driver = graphs[0].listener("driver", "/speed", speed_type)
     driver.until(lambda: "connected" in driver.lines, "connection")
     operator, started_us, seq = embedded.cloud.client("iot-data"), time.time_ns() // 1000, 0
     topic = build_topic(CMD, cars[0].robot, "drive", embedded.namespace)

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from testkit.ros2 import ABSENT, Domain, Ros2, Ros2Error, find
+from tests.ros.conftest import downlink
 from tests.ros.process import Process
 
 SCRIPTS = Path(__file__).resolve().parent / "nodes"
@@ -33,6 +34,8 @@ def ros2() -> Ros2:
 
 class Graph:
     """A ROS 2 graph of its own: a domain that only this machine sees, and the processes in it."""
+
+    ros = 2
 
     def __init__(self, ros2: Ros2, folder: Path) -> None:
         self.ros2, self.python, self.folder = ros2, ros2.python, folder
@@ -63,6 +66,10 @@ class Graph:
     def listener(self, name: str, topic: str, kind: str) -> Process:
         """Run a foreign subscriber, whose lines are ``connected``, then ``[time, message]``."""
         return self.run("listener.py", name, topic, kind)
+
+    def downlink(self, settings: object, *arguments: str) -> Process:
+        """Run the agent's downlink alone; see tests/ros/nodes/downlinks.py."""
+        return self.start(downlink(self.python, self.folder, settings, "--ros2", *arguments))
 
     def collector(self, topics: dict[str, Any], **settings: Any) -> Process:
         """Run the agent's source alone, whose lines are samples; see tests/ros/nodes/collector.py."""

@@ -1,9 +1,10 @@
 """The downlinks of one or two robots, in one ROS graph and over a broker in memory.
 
-Usage: ``downlinks.py CONFIG.json`` with ``downlink`` and ``share``, and ``--guard`` for the process that
-stops the robot if this one dies. Each line of input is a command: ``send MILLISECONDS JSON`` (a lease and a
-message), ``pose ROBOT JSON``, ``await TOPIC COUNT`` (waits for subscribers, then prints ``heard``), ``guard``
-(waits for the guard, then prints ``guarded``), ``stop`` (the emergency stop), ``cut``, ``quit``.
+Usage: ``downlinks.py CONFIG.json`` with ``downlink`` and ``share``; ``--ros2`` for a graph of ROS 2, and
+``--guard`` for the process that stops the robot if this one dies. Each line of input is a command: ``send
+MILLISECONDS JSON`` (a lease and a message), ``pose ROBOT JSON``, ``await TOPIC COUNT`` (waits for
+subscribers, then prints ``heard``), ``guard`` (waits for the guard, then prints ``guarded``), ``stop`` (the
+emergency stop), ``cut``, ``quit``.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from iort_agent.control import Bridge
 from iort_agent.control.commands import Operator
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
-from iort_agent.control.guard import Guard
+from iort_agent.control.guard import NODES, Guard
 from iort_agent.control.questions import Questions
 from iort_agent.files.upload import downloader, make_uploader
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.ros.ros1_node import DEFAULT_NODE, shared
+from iort_agent.ros.ros1_node import DEFAULT_NODE
 from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
 from iort_contract.messages.questions import Answer, Refusal, decode_ask, encode_answer
 from testkit.agent import Loopback, Published, link_of
@@ -47,13 +48,14 @@ def cloud(message: Published) -> None:
 
 
 uplink.verdict = cloud
-link, graph = link_of(uplink, clock), shared(DEFAULT_NODE, clock)
+link, ros = link_of(uplink, clock), 2 if "--ros2" in sys.argv else 1
+graph = NODES[ros](DEFAULT_NODE, clock)
 questions = None
 if "ask" in settings.get("downlink", {}):
     uploader = make_uploader(link, root_ca=None, rate_kb_s=0)
     questions = Questions(link, uploader, download=downloader(None), offset=lambda: None)
 config = load(DownlinkConfig, settings.get("downlink", {}), where)
-guard = Guard(graph.base, config.motions(), clock) if "--guard" in sys.argv else None
+guard = Guard(graph.base, config.motions(), clock, ros=ros) if "--guard" in sys.argv else None
 downlink = Downlink(
     config,
     share_rule()(settings["share"], where) if "share" in settings else (),

@@ -1,5 +1,6 @@
 """An rclpy subscriber that knows nothing of the agent: ``listener.py NAME TOPIC TYPE`` prints each message as
-a line of JSON, with the time of its arrival. ``--latched`` asks for what was published before.
+a line of JSON, with the time of its arrival, and ``connected`` and ``publishers N`` when there are any or
+others. ``--latched`` asks for what was published before.
 """
 
 import json
@@ -38,11 +39,13 @@ def listen():
 
 
 threading.Thread(target=listen, daemon=True).start()
-connected = False
+publishers = 0
 while not stop.is_set():
     executor.spin_once(timeout_sec=0.1)
-    if not connected and node.count_publishers(topic):
-        connected = True
-        say("connected")
+    if (count := node.count_publishers(topic)) != publishers:
+        if not publishers:
+            say("connected")
+        say(f"publishers {count}")
+        publishers = count
 node.destroy_node()
 rclpy.shutdown()

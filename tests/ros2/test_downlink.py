@@ -1,0 +1,14 @@
+"""From the broker to real ROS 2 topics: what tests/ros/test_downlink.py holds over ROS 1 holds here, too."""
+
+from tests.ros.test_downlink import (  # noqa: F401 - collected here, with the graph of this folder
+    driven,
+    test_a_command_is_not_kept_for_a_late_subscriber,
+    test_a_command_is_published_and_its_lease_ends_in_stops,
+    test_a_guard_that_dies_is_started_again_and_nothing_moves_meanwhile,
+    test_a_killed_and_a_frozen_agent_are_stopped_by_the_guard,
+    test_a_lost_connection_or_the_agents_end_stops_the_car,
+    test_a_renewed_lease_does_not_end,
+    test_an_emergency_stop_outlives_a_killed_and_a_frozen_agent,
+    test_an_invalid_message_is_rejected,
+    test_another_robots_pose_appears_as_a_topic,
+)
