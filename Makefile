@@ -75,7 +75,7 @@ prove-ros2: setup ## drive a robot of ROS 2 beside ros2 bag record: DURATION=60 
 		$(BIN)/python -m pytest -rA tests/ros2/proof
 
 # The options of the bench's sections: `python -m bench.run --help` tells whose.
-BENCH_OPTIONS := CARS DURATION KILLS NEW OLD PART PRESSES QUICK RATE ROBOTS ROUNDS SECONDS SEED SOAK TRIES
+BENCH_OPTIONS := CARS DURATION KILLS MESSAGES NEW OLD PART PRESSES QUICK RATE ROBOTS ROUNDS SECONDS SEED SOAK TRIES
 
 bench: setup ## measure every table of the thesis, or others: ONLY=query,outage or agent, drive, fleet ..., TARGET=aws OUT=docs/bench
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) \

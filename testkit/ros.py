@@ -48,15 +48,48 @@ def python_with_rospy() -> str:
     return str(python)
 
 
-class RosGraph:
+class Nodes:
+    """The processes of a graph, from `__enter__` to `__exit__`, each with a log in ``folder``."""
+
+    def __init__(self, python: str, folder: Path, environment: dict[str, str]) -> None:
+        self._python, self._folder, self.environment = python, folder, environment
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in reversed(self._processes):
+            process.kill()
+            process.communicate()
+
+    def start(self, module: str, *arguments: object) -> subprocess.Popen[str]:
+        """Run a module under the Python that has the ROS."""
+        return self.run([self._python, "-m", module, *map(str, arguments)])
+
+    def run(self, command: list[str]) -> subprocess.Popen[str]:
+        with (self._folder / f"{len(self._processes)}.log").open("w") as log:
+            process = subprocess.Popen(
+                command,
+                env=self.environment,
+                cwd=ROOT,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+            )
+        self._processes.append(process)
+        return process
+
+
+class RosGraph(Nodes):
     """A master that runs from `__enter__` to `__exit__`; `start` adds nodes."""
 
     def __init__(self, python: str, folder: Path) -> None:
-        self._python, self._folder = python, folder
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = int(probe.getsockname()[1])
-        self.environment = {
+        environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith("ROS_")},
             "ROS_MASTER_URI": f"http://127.0.0.1:{port}",
             "ROS_IP": "127.0.0.1",
@@ -65,8 +98,8 @@ class RosGraph:
             "PYTHONPATH": PYTHONPATH,
             "PYTHONUNBUFFERED": "1",
         }
+        super().__init__(python, folder, environment)
         self.master = [SYSTEM_PYTHON, str(shutil.which("rosmaster")), "--core", "-p", str(port)]
-        self._processes: list[subprocess.Popen[str]] = []
 
     def __enter__(self) -> Self:
         self.run(self.master)
@@ -88,35 +121,12 @@ class RosGraph:
             else:
                 return
 
-    def __exit__(self, *_: object) -> None:
-        for process in reversed(self._processes):
-            process.kill()
-            process.communicate()
-
-    def start(self, module: str, *arguments: object) -> subprocess.Popen[str]:
-        """Run a module under the Python that has rospy."""
-        return self.run([self._python, "-m", module, *map(str, arguments)])
-
     def publisher(
         self, node: str, seconds: float, subscribers: int = 2, rate_hz: float | None = None
     ) -> Publisher:
         """Return a node of the robot, which publishes its topics for ``seconds`` after `Publisher.go`."""
         rate = [] if rate_hz is None else [rate_hz]
         return Publisher(self.start("bench.ros.publisher", node, seconds, subscribers, *rate))
-
-    def run(self, command: list[str]) -> subprocess.Popen[str]:
-        with (self._folder / f"{len(self._processes)}.log").open("w") as log:
-            process = subprocess.Popen(
-                command,
-                env=self.environment,
-                cwd=ROOT,
-                text=True,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-            )
-        self._processes.append(process)
-        return process
 
 
 class Publisher:

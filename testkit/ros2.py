@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from testkit.ros import PYTHONPATH
+from testkit.ros import PYTHONPATH, Nodes, Publisher
 from testkit.waiting import InstrumentError
 
 INSTALLED = Path("/opt/ros")
@@ -138,3 +138,25 @@ def _used(domain: int) -> bool:
         except OSError:
             return True
     return False
+
+
+class Ros2Graph(Nodes):
+    """A graph of one middleware in a domain of its own."""
+
+    def __init__(self, ros2: Ros2, folder: Path, middleware: str) -> None:
+        self._domain = Domain()
+        environment = {
+            **ros2.alone(self._domain.number),
+            "RMW_IMPLEMENTATION": middleware,
+            "ROS_LOG_DIR": str(folder),
+            "ROS_HOME": str(folder),
+        }
+        super().__init__(ros2.python, folder, environment)
+
+    def __exit__(self, *reason: object) -> None:
+        super().__exit__(*reason)
+        self._domain.close()
+
+    def publisher(self, load: str, messages: int, subscribers: int) -> Publisher:
+        """Return a publisher of the bench's load, which sends so many messages of each topic."""
+        return Publisher(self.start("bench.ros.ros2_publisher", load, messages, subscribers))

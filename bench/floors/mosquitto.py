@@ -92,8 +92,8 @@ class Mosquitto:
         """A new certificate and its key, as files."""
         return self._authority.write(self._folder, name, HOST)
 
-    def car(self, topics: Mapping[str, Mapping[str, str]]) -> Path:
-        """Write and return the configuration of an agent that subscribes to these topics of ROS 1."""
+    def car(self, topics: Mapping[str, Mapping[str, str]], source: str = "ros1") -> Path:
+        """Write and return the configuration of an agent that subscribes to these topics."""
         certificate, key = self.identity(ROBOT)
         settings = {
             "robot": ROBOT,
@@ -102,7 +102,7 @@ class Mosquitto:
             "certificate": str(certificate),
             "private_key": str(key),
             "root_ca": str(self.ca),
-            "sources": [{"type": "ros1", "topics": {name: dict(one) for name, one in topics.items()}}],
+            "sources": [{"type": source, "topics": {name: dict(one) for name, one in topics.items()}}],
             "queue": {"path": "spool.db"},
             # Nobody holds a lease here.
             "live": {"when": "always"},

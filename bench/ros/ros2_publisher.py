@@ -1,0 +1,73 @@
+"""A load of the bench on a ROS 2 graph; runs under a Python with rclpy.
+
+    python -m bench.ros.ros2_publisher LOAD MESSAGES SUBSCRIBERS
+
+Waits for the subscribers of each topic, then for a line on its input. Publishes so many prepared messages of
+each topic, reliably and in turns, with stamps of now. At the end it prints their number, and ends after a
+line. It publishes bytes, as making a message of Python's objects would take most of a core.
+"""
+
+import math
+import struct
+import sys
+import threading
+import time
+from typing import Any
+
+import rclpy
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
+from rosidl_runtime_py.utilities import get_message
+
+from bench.ros.ros2_loads import LARGE, LOADS
+
+# A second of the fastest topic, and more.
+_DEPTH = 2000
+_BODIES = 97
+
+
+def bodies(kind: str) -> list[bytearray]:
+    """Messages of a type, with some noise."""
+    made = []
+    for i in range(_BODIES):
+        message: Any = get_message(kind)()
+        message.header.frame_id = "base_link"
+        if hasattr(message, "data"):
+            message.format = "jpeg"
+            message.data = bytes((i * 7 + k * k // 3) & 0xFF for k in range(LARGE))
+        else:
+            turn, pull = message.angular_velocity, message.linear_acceleration
+            turn.z, turn.x = math.sin(i / 7), round(math.cos(i / 9) * 100) / 32768
+            pull.x, pull.z = round(math.cos(i / 5) * 100) / 32768, 9.80665
+            message.orientation.w, message.orientation.z = math.cos(i / 30), math.sin(i / 30)
+        made.append(bytearray(serialize_message(message)))
+    return made
+
+
+def main() -> None:
+    """Publish until every message is sent."""
+    load, messages, subscribers = LOADS[sys.argv[1]], int(sys.argv[2]), int(sys.argv[3])
+    rclpy.init(args=[])
+    node = rclpy.create_node("bench_publisher")
+    qos = QoSProfile(depth=_DEPTH)
+    publishers = [node.create_publisher(get_message(load.kind), topic, qos) for topic in load.topics]
+    prepared, pause = bodies(load.kind), threading.Event()
+    while any(publisher.get_subscription_count() < subscribers for publisher in publishers):
+        pause.wait(0.05)
+    print("ready", flush=True)
+    sys.stdin.readline()
+    began, every_s = time.monotonic(), 1 / (load.rate_hz * len(publishers))
+    for n in range(messages * len(publishers)):
+        ahead_s = began + n * every_s - time.monotonic()
+        if ahead_s > 0:
+            time.sleep(ahead_s)
+        body = prepared[n % _BODIES]
+        struct.pack_into("<iI", body, 4, *divmod(time.time_ns(), 1_000_000_000))
+        publishers[n % len(publishers)].publish(bytes(body))
+    print(messages * len(publishers), flush=True)
+    sys.stdin.readline()
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+main()
