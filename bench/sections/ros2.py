@@ -179,7 +179,7 @@ def _await_received(socket: Path, streams: set[str], count: int) -> None:
     def received() -> bool:
         with suppress(AgentError):  # it is too busy to answer
             counts: dict[str, Any] = fetch(socket)["streams"]
-            return sum(counts.get(stream, {}).get("samples", 0) for stream in streams) >= count
+            return sum(int(counts.get(stream, {}).get("samples", 0)) for stream in streams) >= count
         return False
 
     reached(received, within_s=_CATCH_UP_S, poll_s=0.2)

@@ -13,6 +13,7 @@ from bench.sections import (
     mixed,
     outage,
     query,
+    ros2,
     round_trips,
     utilisation,
     viewing,
@@ -112,6 +113,20 @@ def test_a_query_is_shown_beside_the_thesis_query_from_the_same_place():
     assert theirs[query.OURS_QUERY] == theirs[query.THESIS_QUERY] == "6.1 s"
     assert theirs[query.OURS_SCAN] == theirs[query.THESIS_SCAN] == "14.1 s"
     assert theirs[query.LAMBDA_QUERY] == "5.5 s (512 MB)"
+
+
+def test_the_ros2_section_has_targets_for_processor_loss_and_delay():
+    runs = [
+        ros2.Run(
+            "rmw_a", load, 1000, {ros2.AGENT: agent_us, ros2.FLOOR: 100.0}, {}, {ros2.AGENT: lost}, {}, {}
+        )
+        for load, agent_us, lost in (("fast", 80.0, 0), ("many", 120.0, 3), ("big", 300.0, 0))
+    ]
+    section = Section("ros2", "")
+    ros2.report(section, runs, {"rmw_a": (ros2.Spread(2.5, 3.0, 9), ros2.Spread(1.0, 2.0, 9))})
+    floors = [(ratio.value, ratio.reached) for ratio in section.ratios if ros2.FLOOR in ratio.name]
+    assert floors == [(0.8, True), (1.2, False), (3.0, None), (1.5, False)]
+    assert [ratio.value for ratio in section.ratios if "lost" in ratio.name] == [0, 3, 0]
 
 
 def test_the_mixed_robots_topics_have_the_types_of_their_definitions():
