@@ -53,8 +53,7 @@ def test_rosbag_play_replays_every_message(graph: Graph, player: list[str], tmp_
     ride = tmp_path / "ride.bag"
     with bags.bag(ride) as file:
         for stream, messages in went.items():
-            kind = kinds[stream]
-            write = file.topic(kind.topic, kind.kind, kind.definition, kind.md5sum)
+            write = file.topic(kinds[stream]).write
             for t_us, raw in messages:
                 write(t_us * 1000, raw)
 

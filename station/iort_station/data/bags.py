@@ -1,135 +1,160 @@
-"""Writes recordings for other tools: MCAP, which Foxglove opens, and ROS 1 bags, which `rosbag play`
-plays."""
+"""Writes recordings for other tools: MCAP, which Foxglove opens, ROS 1 bags, which `rosbag play` plays, and
+folders of ROS 2, which `ros2 bag play` plays, as it does an MCAP of ROS 2."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import Any, Protocol
+from tempfile import TemporaryDirectory
+from typing import NamedTuple, Protocol
 
 from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as FolderWriter
+from rosbags.rosbag2.metadata import dump_qos_v8
 
-from iort_contract.limits import MessageError
-from iort_contract.ros.definition import md5sum as md5sum_of
-from iort_contract.ros.definition import parse
+from iort_contract.ros.message import MessageType
+from iort_station.data.ros_forms import Form, form_of, is_ros2
 from iort_station.errors import StationError
-from iort_station.output import whole
+from iort_station.output import check_free, whole
 
 Write = Callable[[int, bytes], None]
 
-# ROS 1 has its own of these: a header with a seq, and times that are no messages.
-_OF_ROS2 = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-_EMPTY = "std_msgs/msg/Empty"
+
+class Topic(NamedTuple):
+    """A topic's messages of one type in a file. ``write`` takes the time in nanoseconds since the epoch and
+    a message as it was recorded, and raises `ConversionError`; ``form`` is what the file has of it."""
+
+    write: Write
+    form: Form
 
 
 class Recording(Protocol):
-    """A file of messages. ``ros2`` is true if it can hold those of ROS 2, too."""
+    """A file of messages."""
 
-    ros2: bool
-
-    def topic(self, topic: str, kind: str, definition: str, md5sum: str, *, ros2: bool = False) -> Write:
-        """Begin a topic's messages of one ROS 1 type. The function that is returned writes a message, with
-        its time in nanoseconds since the epoch; with ``ros2``, in ROS 2's form, if the file can hold it.
-        Raises `StationError` for an invalid definition."""
+    def topic(self, kind: MessageType) -> Topic:
+        """Begin a topic's messages of one type. Raises `StationError` for a type that the file cannot
+        hold."""
 
 
-class _Bag:
-    ros2 = False
+class _File(ABC):
+    def __init__(self, *, ros2: bool | None) -> None:
+        self._ros2 = ros2
+        self._begun: dict[tuple[str, str, str], Write] = {}
 
-    def __init__(self, writer: BagWriter) -> None:
-        self._writer = writer
-        self._connections: dict[tuple[str, str, str], Any] = {}
-
-    def topic(
-        self,
-        topic: str,
-        kind: str,
-        definition: str,
-        md5sum: str,
-        *,
-        ros2: bool = False,  # noqa: ARG002 - a bag of ROS 1
-    ) -> Write:
-        named = (topic, kind, md5sum)
-        if named not in self._connections:
+    def topic(self, kind: MessageType) -> Topic:
+        form = form_of(kind, ros2=is_ros2(kind) if self._ros2 is None else self._ros2)
+        named = (kind.topic, form.kind, form.md5sum)
+        if named not in self._begun:
             try:
-                self._connections[named] = self._writer.add_connection(
-                    topic,
-                    kind.replace("/", "/msg/"),
-                    msgdef=definition,
-                    md5sum=md5sum or checksum(kind, definition),
-                    # A bag tells two types of one topic apart by their publishers.
-                    callerid="/iort" if not self._connections else f"/iort_{len(self._connections)}",
-                )
+                self._begun[named] = self._begin(kind.topic, form)
+            except StationError:
+                raise
             except Exception as error:  # a bag library may raise anything
-                raise StationError(f"topic {topic} of type {kind} cannot be written: {error}") from error
-        connection = self._connections[named]
+                raise StationError(
+                    f"topic {kind.topic} of type {form.kind} cannot be written: {error}"
+                ) from error
+        write = self._begun[named]
+        return Topic(lambda t_ns, message: write(t_ns, form.convert(message)), form)
+
+    @abstractmethod
+    def _begin(self, topic: str, form: Form) -> Write:
+        """Begin a topic's messages of one type."""
+
+
+class _Bag(_File):
+    def __init__(self, writer: BagWriter) -> None:
+        super().__init__(ros2=False)
+        self._writer = writer
+
+    def _begin(self, topic: str, form: Form) -> Write:
+        connection = self._writer.add_connection(
+            topic,
+            form.kind.replace("/", "/msg/"),
+            msgdef=form.definition,
+            md5sum=form.md5sum,
+            # A bag tells two types of one topic apart by their publishers.
+            callerid="/iort" if not self._begun else f"/iort_{len(self._begun)}",
+        )
         return lambda t_ns, message: self._writer.write(connection, t_ns, message)
 
 
-class _Mcap:
-    ros2 = True
-
-    def __init__(self, writer: McapWriter) -> None:
+class _Mcap(_File):
+    def __init__(self, writer: McapWriter, *, ros2: bool) -> None:
+        super().__init__(ros2=True if ros2 else None)
         self._writer = writer
         self._sequence = 0
-        self._begun = False
+        self.profiles: set[str] = set()
 
-    def begin(self, profile: str) -> None:
-        """Write the head of the file, once. Some readers of ROS 2 insist on its profile."""
-        if not self._begun:
-            self._writer.start(profile=profile, library="iort")
-            self._begun = True
-
-    def topic(self, topic: str, kind: str, definition: str, md5sum: str, *, ros2: bool = False) -> Write:
-        self.begin("ros2" if ros2 else "ros1")
-        convert: Callable[[bytes], bytes] | None = None
-        if ros2:
-            text, convert = _to_ros2(kind, definition)
-            schema = self._writer.register_schema(_ros2_name(kind), "ros2msg", text.encode())
-            channel = self._writer.register_channel(topic, "cdr", schema)
+    def _begin(self, topic: str, form: Form) -> Write:
+        self.profiles.add("ros2" if form.ros2 else "ros1")
+        schema = self._writer.register_schema(
+            form.kind, "ros2msg" if form.ros2 else "ros1msg", form.definition.encode()
+        )
+        if form.ros2:
+            about = {"offered_qos_profiles": dump_qos_v8(_qos(topic)), "topic_type_hash": form.md5sum}
         else:
-            schema = self._writer.register_schema(kind, "ros1msg", definition.encode())
-            about = {"md5sum": md5sum or checksum(kind, definition), "callerid": "/iort"}
-            channel = self._writer.register_channel(topic, "ros1", schema, about)
+            about = {"md5sum": form.md5sum, "callerid": "/iort"}
+        channel = self._writer.register_channel(topic, "cdr" if form.ros2 else "ros1", schema, about)
 
         def write(t_ns: int, message: bytes) -> None:
-            data = message if convert is None else bytes(convert(message))
-            self._writer.add_message(channel, t_ns, data, t_ns, self._sequence)
+            self._writer.add_message(channel, t_ns, message, t_ns, self._sequence)
             self._sequence += 1
 
         return write
 
 
-def _ros2_name(kind: str) -> str:
-    return kind.replace("/", "/msg/", 1)
+class _Folder(_File):
+    def __init__(self, writer: FolderWriter) -> None:
+        super().__init__(ros2=True)
+        self._writer = writer
+        self._kinds: dict[str, str] = {}
+        self._hashes: dict[str, str] = {}
+
+    def _begin(self, topic: str, form: Form) -> Write:
+        # The player opens a publisher for each topic, and the file has a definition for each type's name.
+        if self._kinds.setdefault(topic, form.kind) != form.kind:
+            problem = f"{topic} has messages of {self._kinds[topic]} and {form.kind}"
+        elif self._hashes.setdefault(form.kind, form.md5sum) != form.md5sum:
+            problem = f"{form.kind} has two definitions in this range"
+        else:
+            connection = self._writer.add_connection(
+                topic,
+                form.kind,
+                msgdef=form.definition,
+                rihs01=form.md5sum,
+                offered_qos_profiles=_qos(topic),
+            )
+            return lambda t_ns, message: self._writer.write(connection, t_ns, message)
+        raise StationError(f"{problem}, which a folder of ROS 2 cannot hold: an .mcap can")
 
 
-def _to_ros2(kind: str, definition: str) -> tuple[str, Callable[[bytes], bytes]]:
-    """ROS 2's definition of a type that was converted from it, and what converts its messages back."""
-    name, known = _ros2_name(kind), get_typestore(Stores.ROS2_HUMBLE).fielddefs
-    try:
-        types = {**get_types_from_msg(definition, name), **{same: known[same] for same in _OF_ROS2}}
-        for nested, (constants, fields) in types.items():
-            # A message of ROS 2 is never empty.
-            types[nested] = constants, fields or [known[_EMPTY][1][0]]
-        store = get_typestore(Stores.EMPTY)
-        store.register(types)
-        text, _ = store.generate_msgdef(name, ros_version=2)
-    except Exception as error:  # a bag library may raise anything
-        raise StationError(f"the type {kind} cannot be written as one of ROS 2: {error}") from error
-    return text, partial(store.ros1_to_cdr, typename=name)
+# Topics whose last messages a subscriber gets that comes later. Others may subscribe to them as to any.
+_LATCHED = ("map", "map_metadata", "robot_description", "tf_static")
+_UNLIMITED = QosTime(2147483647, 4294967295)
 
 
-def checksum(kind: str, definition: str) -> str:
-    """ROS 1's MD5 of a definition. Raises `StationError` if the definition is invalid."""
-    try:
-        return md5sum_of(parse(kind, definition), definition)
-    except (MessageError, KeyError, ValueError) as error:
-        raise StationError(f"the type {kind} cannot be read: {error}") from error
+def _qos(topic: str) -> list[Qos]:
+    """What a player offers, so that every subscriber of the robot's gets the messages."""
+    latched = topic.rpartition("/")[2] in _LATCHED
+    return [
+        Qos(
+            QosHistory.KEEP_LAST,
+            10,
+            QosReliability.RELIABLE,
+            QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+            _UNLIMITED,
+            _UNLIMITED,
+            QosLiveliness.AUTOMATIC,
+            _UNLIMITED,
+            avoid_ros_namespace_conventions=False,
+        )
+    ]
 
 
 @contextmanager
@@ -140,14 +165,44 @@ def bag(path: Path, *, force: bool = False) -> Iterator[Recording]:
 
 
 @contextmanager
-def mcap(path: Path, *, force: bool = False) -> Iterator[Recording]:
-    """A new MCAP file, which appears once it is whole. Raises `StationError` if the file exists."""
+def mcap(path: Path, *, force: bool = False, ros2: bool = False) -> Iterator[Recording]:
+    """A new MCAP file, which appears once it is whole; with ``ros2``, of ROS 2's messages alone. Raises
+    `StationError` if the file exists."""
     with whole(path, force=force) as part, part.open("wb") as file:
         writer = McapWriter(file)
-        recording = _Mcap(writer)
+        _start(writer, "")
+        recording = _Mcap(writer, ros2=ros2)
         yield recording
-        recording.begin("ros1")
         writer.finish()
+        # Some readers of ROS 2 insist on its profile; a file of both has none.
+        profiles, head = recording.profiles, BytesIO()
+        _start(McapWriter(head), profiles.pop() if len(profiles) == 1 else "")
+        file.seek(0)
+        file.write(head.getvalue())
 
 
-KINDS = {".bag": bag, ".mcap": mcap}
+def _start(writer: McapWriter, profile: str) -> None:
+    """Write the head of a file, of the same length for every profile."""
+    writer.start(profile=profile, library="iort".ljust(len("iortros2") - len(profile)))
+
+
+@contextmanager
+def folder(path: Path, *, force: bool = False) -> Iterator[Recording]:
+    """A new folder of ROS 2 with an SQLite database, which appears once it is whole. Raises `StationError` if
+    it exists; with ``force``, if it is something else than such a folder."""
+    check_free(path, force=force)
+    if path.exists() and not (path / "metadata.yaml").is_file():
+        raise StationError(f"{path} is no recording of ROS 2: give another --out")
+    if not path.parent.is_dir():
+        raise StationError(f"{path} must be in a folder that exists")
+    with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as temporary:
+        # The files in it have its name. Humble reads this version, as all after it do.
+        part = Path(temporary) / path.name
+        with FolderWriter(part, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+            yield _Folder(writer)
+        if path.exists():
+            path.rename(Path(temporary) / "before")
+        part.rename(path)
+
+
+KINDS = {".bag": bag, ".mcap": mcap, "": folder}

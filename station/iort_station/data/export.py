@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -18,8 +19,9 @@ from iort_contract.ros.message import ROS2, MessageType, filled
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, ros_messages
-from iort_station.data.bags import Recording, Write
+from iort_station.data.bags import Recording, Topic
 from iort_station.data.recorded import Recorded, Selection
+from iort_station.data.ros_forms import ConversionError, is_ros2
 from iort_station.fleet import files
 
 # Gives the content of an uploaded file by its key; None if the file is missing.
@@ -123,76 +125,81 @@ def write(
     """Write the messages of a selection and return their number; ``say`` takes lines about the result,
     ``origin`` grows by what comes from the archive, and ``refused`` counts what cannot be exported.
 
-    ROS messages are written as they were published, and those of ROS 2 in its form if ``file`` can hold it.
-    Other samples become messages of the type that their source gave, or of their fields.
+    ROS messages are written as they were published, or in the form of the ROS whose messages ``file`` can
+    hold. Other samples become messages of the type that their source gave, or of their fields.
     """
     robot, stream = selection.robot, selection.stream
-    known = {name: kind for name, (_, kind) in ros_messages.types(cloud, robot, stream).items()}
+    declared = ros_messages.types(cloud, robot)
+    known = {name: kind for name, kind in declared.items() if kind.stream == stream}
     export = Export(cloud, selection, known, lambda key: files.content(cloud, key), origin)
-    counts: dict[str, int] = {}
-    writers: dict[str, Write] = {}
+    counts: Counter[str] = Counter()
+    topics: dict[str, Topic] = {}
+    unfit: list[str] = []
     for t_us, name, raw in export.messages(progress):
-        if name not in writers:
-            kind = export.types[name]
-            ros2 = kind.converted_from == ROS2
-            writers[name] = file.topic(kind.topic, kind.kind, kind.definition, kind.md5sum, ros2=ros2)
-        writers[name](t_us * 1000, raw)
-        counts[name] = counts.get(name, 0) + 1
-    for name, count in counts.items():
+        if name not in topics:
+            topics[name] = file.topic(export.types[name])
+        try:
+            topics[name].write(t_us * 1000, raw)
+        except ConversionError as error:
+            unfit.append(str(error))
+        else:
+            counts[name] += 1
+    for name, topic in topics.items():
         kind = export.types[name]
-        form = "as they were published"
-        if kind.converted_from == ROS2:
-            form = "of ROS 2, converted to ROS 1 when they were recorded"
-            form += " and back for this file" if file.ros2 else ""
-        say(f"{robot} {stream}: {count:,} messages of {kind.kind} on {kind.topic}, {form}")
+        say(f"{robot} {stream}: {counts[name]:,} messages of {kind.kind} on {kind.topic}, {topic.form.note}")
         if name not in known:
             say("  its definition is not stored, so topic, comments and constants are not the publisher's")
+    if unfit:
+        say(f"{len(unfit):,} messages cannot be converted and are left out; the first: {unfit[0]}")
     if refused is not None:
         refused.count += export.refused.count
     if export.refused.count:
         say(f"{export.refused.count:,} stored items cannot be exported; the first: {export.refused.reason}")
     if export.empty:
         say(f"{export.empty} messages have an empty array: their content was not kept, or is not uploaded")
-    made = _make(cloud, selection, file, known, say) if export.others else 0
-    if not counts and not made and not export.refused.count:
+    made = _make(cloud, selection, file, list(declared.values()), say) if export.others else 0
+    if not topics and not made and not export.refused.count:
         inventory.check_there(cloud, robot, stream)
         say(f"{robot} {stream}: no samples in this range")
     return sum(counts.values()) + made
 
 
 def _make(
-    cloud: Cloud, selection: Selection, file: Recording, known: Mapping[str, MessageType], say: Say
+    cloud: Cloud, selection: Selection, file: Recording, declared: Sequence[MessageType], say: Say
 ) -> int:
     """Write messages made of the samples that are not ROS messages, and return their number."""
     robot, stream = selection.robot, selection.stream
     blocks = data.samples(cloud, selection, messages=False)
+    known = [kind for kind in declared if kind.stream == stream]
     # If topics share a stream, nobody can tell which one a selection of fields belongs to.
-    shared = len({kind.topic for kind in known.values()}) > 1
-    kind = None if shared else next(iter(reversed(list(known.values()))), None)
-    makers: dict[tuple[tuple[str, str], ...], tuple[ros_messages.Maker, Write]] = {}
+    shared = len({kind.topic for kind in known}) > 1
+    kind = ros_messages.in_ros1(known[-1]) if known and not shared else None
+    # Beside messages of ROS 2, those without a type are ROS 2's, too.
+    origin = ROS2 if any(map(is_ros2, declared)) else ""
+    makers: dict[tuple[tuple[str, str], ...], tuple[ros_messages.Maker, Topic]] = {}
     numbers, written = itertools.count(), 0
     for block in blocks:
         # While a robot drives, fields come and go, and the kind of a field's values may change.
         shape = tuple(sorted((name, column.dtype.kind) for name, column in block.columns.items()))
         if shape not in makers:
-            made = kind or ros_messages.made_of(stream, block.columns)
+            made = kind or ros_messages.made_of(stream, block.columns, len(makers))
+            made = made._replace(converted_from=made.converted_from or origin)
             maker = ros_messages.Maker(made, list(block.columns), own=kind is None, numbers=numbers)
-            topic = file.topic(maker.kind.topic, maker.kind.kind, maker.definition, maker.md5sum)
-            makers[shape] = maker, topic
-        maker, write_one = makers[shape]
+            makers[shape] = maker, file.topic(maker.kind)
+        maker, topic = makers[shape]
         for t_ns, message in maker.messages(block):
-            write_one(t_ns, message)
+            topic.write(t_ns, message)
             written += 1
     if not makers:
         return 0
-    made = maker.kind
-    say(f"{robot} {stream}: {written:,} messages of {made.kind} on {made.topic}, made of samples")
+    topics = ", ".join(dict.fromkeys(maker.kind.topic for maker, _ in makers.values()))
+    say(f"{robot} {stream}: {written:,} messages of {topic.form.kind} on {topics}, made of samples")
     if shared:
         say(f"several topics of {robot} share {stream}, so the type is made of the selected fields")
     elif kind is None:
         say(f"{robot} has not sent the type of {stream}, so the type is made of its fields")
     if len(makers) > 1 and kind is None:
-        say(f"its fields changed, so there are {len(makers)} types of that name")
+        say(f"its fields changed, so there are {len(makers)} types, each on a topic of its own")
     lacking = {name for maker, _ in makers.values() for name in maker.lacking}
     foreign = {name for maker, _ in makers.values() for name in maker.foreign}
     if lacking:

@@ -23,36 +23,42 @@ from iort_contract.ros.definition import (
     md5sum,
     parse,
 )
-from iort_contract.ros.message import MessageType
+from iort_contract.ros.message import ROS2, MessageType
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
+from iort_station.data.ros_forms import form_of
 from iort_station.errors import StationError
 
 _HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
-# A ROS 2 header has no seq. The definition may end the text.
-_ROS2_HEADER = re.compile(r"=+\nMSG: std_msgs/Header\n\s*time stamp\n\s*string frame_id(\n|\Z)")
-_ROS2_TIMES = re.compile(r"\bbuiltin_interfaces/(?:msg/)?(Time|Duration)\b")
 
 
-def types(cloud: Cloud, robot: str, stream: str) -> dict[str, tuple[int, MessageType]]:
-    """The types that a robot has declared for a stream's messages, by id, and the time of the first
-    declaration."""
-    declared_types: dict[str, tuple[int, MessageType]] = {}
-    for t_us, kind in inventory.types_of(cloud, robot):
-        if kind.stream == stream:
-            first_us, before = declared_types.get(kind.id, (t_us, kind))
-            # Some publishers send no definition.
-            declared_types[kind.id] = first_us, before if before.definition.strip() else kind
+def types(cloud: Cloud, robot: str) -> dict[str, MessageType]:
+    """The types that a robot has declared for its messages, by id, in the order of their first
+    declarations."""
+    declared_types: dict[str, MessageType] = {}
+    for _, kind in inventory.types_of(cloud, robot):
+        before = declared_types.get(kind.id, kind)
+        # Some publishers send no definition.
+        declared_types[kind.id] = before if before.definition.strip() else kind
     return declared_types
 
 
-def made_of(stream: str, columns: Mapping[str, Any]) -> MessageType:
-    """A type for samples without one: a header, and a field for each column."""
+def in_ros1(kind: MessageType) -> MessageType:
+    """A type of ROS 2 as one of ROS 1 that becomes ROS 2's again in a file that can hold it."""
+    if "/msg/" not in kind.kind:
+        return kind
+    form = form_of(kind, ros2=False, own=True)
+    return kind._replace(kind=form.kind, definition=form.definition, md5sum=form.md5sum, converted_from=ROS2)
+
+
+def made_of(stream: str, columns: Mapping[str, Any], number: int = 0) -> MessageType:
+    """A type for samples without one: a header, and a field for each column. A stream's second type has
+    ``number`` 1, and another name and topic, as the rest of its types."""
     lines = ["std_msgs/Header header"]
     for name, column in columns.items():
         kind = {"b": "bool", "f": "float64"}.get(column.dtype.kind, STRING)
         lines.append(f"{kind} {_plain(name)}")
-    name = re.sub(r"\W", "_", stream)
+    name = re.sub(r"\W", "_", stream) + (f"_{number + 1}" if number else "")
     kind = f"iort_msgs/{name[:1].upper()}{name[1:]}" if name[:1].isalpha() else f"iort_msgs/S{name}"
     text = "\n".join(lines) + "\n" + _HEADER_TEXT
     return MessageType(stream, f"/{name}", kind, "", text)
@@ -71,14 +77,13 @@ class _Leaf(NamedTuple):
 
 
 class Maker:
-    """Makes messages of one type from samples.
+    """Makes messages of a type of ROS 1 from samples.
 
-    ``definition`` and ``md5sum`` are those of ROS 1, whose headers have a seq, even if the samples come from
-    ROS 2; ``numbers`` gives the seq. ``lacking`` are fields of the type that the samples do not have: they
+    ``numbers`` gives the headers' seq. ``lacking`` are fields of the type that the samples do not have: they
     are zero or empty in the messages. ``foreign`` are fields of the samples that the type does not have.
     ``own`` is for a type of `made_of`.
 
-    Raises `StationError` for a type that ROS 1 cannot have.
+    Raises `StationError` for an invalid definition.
     """
 
     def __init__(
@@ -93,20 +98,14 @@ class Maker:
         self._numbers = count() if numbers is None else numbers
         self._field = _plain if own else str
         fields = [self._field(name) for name in fields]
-        name = kind.kind.replace("/msg/", "/")
-        declared = _ROS2_TIMES.sub(lambda match: match.group(1).lower(), kind.definition)
-        self.definition = _ROS2_HEADER.sub(_HEADER_TEXT, declared)
         try:
-            declared_md5 = md5sum(parse(name, declared), declared)
-            definition = parse(name, self.definition)
-            self.md5sum = md5sum(definition, self.definition)
+            definition = parse(kind.kind, kind.definition)
+            digest = md5sum(definition, kind.definition)
             self._leaves = list(_message(definition, fields))
         except (MessageError, KeyError, ValueError) as error:
             raise StationError(f"the type {kind.kind} cannot be made again: {error}") from error
-        if kind.md5sum not in {"", declared_md5}:
-            raise StationError(
-                f"{kind.kind}: the MD5 of its definition must be {kind.md5sum}, got {declared_md5}"
-            )
+        if kind.md5sum not in {"", digest}:
+            raise StationError(f"{kind.kind}: the MD5 of its definition must be {kind.md5sum}, got {digest}")
         paths = {leaf.path for leaf in self._leaves if leaf.path}
         self.lacking = sorted(paths - set(fields))
         self.foreign = sorted(set(fields) - paths)

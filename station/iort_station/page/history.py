@@ -16,10 +16,11 @@ from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.messages.page import HistoryAnswer, RunsAnswer
+from iort_contract.ros.message import MessageType
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import Selection, bags, export, inventory, tabular
-from iort_station.data.bags import Recording, Write
+from iort_station.data.bags import Recording, Topic
 from iort_station.data.conditions import derive
 from iort_station.data.runs import runs
 from iort_station.errors import StationError
@@ -197,10 +198,9 @@ class _Bounded:
 
     def __init__(self, file: Recording) -> None:
         self._file, self._left = file, MOST_BYTES
-        self.ros2 = file.ros2
 
-    def topic(self, topic: str, kind: str, definition: str, md5sum: str, *, ros2: bool = False) -> Write:
-        write = self._file.topic(topic, kind, definition, md5sum, ros2=ros2)
+    def topic(self, kind: MessageType) -> Topic:
+        topic = self._file.topic(kind)
 
         def bounded(t_ns: int, message: bytes) -> None:
             self._left -= len(message)
@@ -208,9 +208,9 @@ class _Bounded:
                 raise StationError(
                     f"the range has over {MOST_BYTES:,} bytes: choose a shorter one, or run `iort export`"
                 )
-            write(t_ns, message)
+            topic.write(t_ns, message)
 
-        return bounded
+        return topic._replace(write=bounded)
 
 
 def _selection(request: Mapping[str, str]) -> Selection:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO
 
@@ -178,7 +179,9 @@ _BOOKKEEPING = {ACCOUNT_STREAM, TYPES_STREAM}
 @commands.command(
     "export",
     epilog=options.examples(
-        "export car7 vesc --last 10m --out car7.mcap", "export car7 --last 10m --out all.mcap"
+        "export car7 vesc --last 10m --out car7.mcap",
+        "export car7 --last 10m --out all.mcap",
+        "export car7 --last 10m --out ride/",
     ),
 )
 @ranged
@@ -186,16 +189,19 @@ def export(
     context: typer.Context,
     robot: Robot,
     when: When,
-    out: Annotated[Path, option("The file to write: .mcap or .bag.", "--out", "-o")],
+    out: Annotated[Path, option("The file to write: .mcap, .bag, or a folder of ROS 2.", "--out", "-o")],
     streams: Annotated[list[str] | None, argument("The streams, for example vesc. Default: all.")] = None,
+    ros2: Annotated[bool, option("Write messages of ROS 1 as ROS 2's.", "--ros2")] = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a recording: MCAP, which Foxglove opens, or a ROS 1 bag, which rosbag plays.
+    """Write a recording: MCAP, which Foxglove opens; a ROS 1 bag, which rosbag plays; or a folder of ROS 2.
 
-    ROS messages of every type are written byte for byte as they were published. Other samples (of a simulated
-    car, a serial line, a selection of fields) become messages of the type that their source gave, or of their
-    fields. For CSV and Parquet, use iort query.
+    A name without an ending is a folder with an SQLite database. `ros2 bag` plays it, and an MCAP that has
+    only messages of ROS 2. ROS messages of every type are written byte for byte as they were published. A bag
+    has those of ROS 2 in ROS 1's form; a folder, or an MCAP with --ros2, has those of ROS 1 in ROS 2's, which
+    loses the seq of headers. Other samples (of a simulated car, a serial line, a selection of fields) become
+    messages of the type that their source gave, or of their fields. For CSV and Parquet, use iort query.
     """
     # numpy takes longer to load than most commands to run.
     from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
@@ -204,9 +210,11 @@ def export(
     from iort_station.data.inventory import check_recorded, check_there  # noqa: PLC0415 - see above
     from iort_station.data.recorded import select  # noqa: PLC0415 - as above
 
-    kind = bags.KINDS.get(out.suffix)
+    kind = partial(bags.mcap, ros2=True) if ros2 and out.suffix == ".mcap" else bags.KINDS.get(out.suffix)
     if kind is None:
-        raise UsageError(f"the file must end in {' or '.join(bags.KINDS)}, got {out}")
+        raise UsageError(f"the file must end in .bag or .mcap, and a folder in nothing, got {out}")
+    if ros2 and out.suffix == ".bag":
+        raise UsageError(f"{out} has messages of ROS 1: --ros2 needs an .mcap or a folder")
     check_free(out, force=force)
     within = when.range(options.SHORT)
     cloud = context.obj.cloud()

@@ -97,6 +97,8 @@ def _files(tmp_path, monkeypatch):
         (["querry"], 2, "Did you mean 'query'?"),
         (["query", "car", "vesc", "--out", "ride.csv"], 1, "ride.csv exists: give another --out"),
         (["export", "car", "vesc", "--out", "ride.mcap"], 1, "ride.mcap exists: give another --out"),
+        (["export", "car", "--out", "ride.db3"], 2, "must end in .bag or .mcap, and a folder in nothing"),
+        (["export", "car", "--ros2", "--out", "a.bag"], 2, "--ros2 needs an .mcap or a folder"),
         (["plot", "car", "vesc", "--out", "ride.png"], 1, "ride.png exists: give another --out"),
         (["robots", "claim", "car", "--out", "."], 1, "claim.yaml exists: give another --out"),
     ],
