@@ -25,11 +25,13 @@ from iort_contract.limits import (
 )
 from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
 
-# Batches stay readable for ever. `SERIALIZED_CODEC` keeps ROS messages byte for byte:
+# Batches stay readable for ever. The others keep messages of ROS 1 or ROS 2 byte for byte:
 # contract/iort_contract/ros/message.py.
-CODEC, SERIALIZED_CODEC = "steps", "ros1"
+CODEC, ROS1_CODEC, ROS2_CODEC = "steps", "ros1", "ros2"
+CODECS = (CODEC, ROS1_CODEC, ROS2_CODEC)
 # A step has half the characters of its value, and takes as much memory.
-_MOST_BYTES = {CODEC: MAX_COLUMNS_BYTES // 2, SERIALIZED_CODEC: MAX_COLUMNS_BYTES + 2 * 1024 * 1024}
+_MOST_BYTES = {CODEC: MAX_COLUMNS_BYTES // 2}
+_MOST_BYTES.update(dict.fromkeys((ROS1_CODEC, ROS2_CODEC), MAX_COLUMNS_BYTES + 2 * 1024 * 1024))
 # zlib's preset dictionary. It is frozen with the codec's name, since stored batches need it. An unknown field
 # costs its name. The end of the dictionary is the cheapest to refer to.
 DICTIONARY = (

@@ -16,7 +16,7 @@ from iort_analysis.archive.columns import MIXED, column_name, named, runs, to_nu
 from iort_analysis.samples.batches import Part, Wanted
 from iort_analysis.samples.blocks import Block, Column, column_of
 from iort_contract.archive import Hour
-from iort_contract.codec import CODEC, SERIALIZED_CODEC, packed_samples
+from iort_contract.codec import CODEC, packed_samples
 from iort_contract.dynamodb import Item, Keys, starting_between
 from iort_contract.limits import BATCH_VERSION, Value
 from iort_contract.messages.batch import batch_id
@@ -227,9 +227,8 @@ class _Columns:
             return CODEC, packed_samples(dt, fields, about.encode())
         kind = self._table[names.TYPE][start].as_py()
         raw = self._table[names.MESSAGE].slice(start, end - start).to_pylist()
-        return SERIALIZED_CODEC, packed_samples(
-            dt, fields, pack(Messages(kind, layout, raw)), SERIALIZED_CODEC
-        )
+        messages = Messages(kind, layout, raw)
+        return messages.codec, packed_samples(dt, fields, pack(messages), messages.codec)
 
     def _values(self, name: str, start: int, end: int) -> Sequence[Value]:
         if name not in self._kinds:

@@ -24,7 +24,7 @@ from iort_contract.checks import (
 )
 from iort_contract.codec import (
     CODEC,
-    SERIALIZED_CODEC,
+    CODECS,
     check_effort,
     inflate,
     packed_samples,
@@ -225,7 +225,7 @@ def _packed_messages(
     if numbers is not None:
         columns, about = numbers
         return CODEC, written_samples(dt, columns, about.encode())
-    return SERIALIZED_CODEC, packed_samples(dt, beside, pack(messages), SERIALIZED_CODEC)
+    return messages.codec, packed_samples(dt, beside, pack(messages), messages.codec)
 
 
 class Envelope(NamedTuple):
@@ -249,7 +249,7 @@ class Envelope(NamedTuple):
     @property
     def serialized(self) -> bool:
         """Whether the samples are ROS messages that were stored unchanged."""
-        return self.codec == SERIALIZED_CODEC
+        return self.codec != CODEC
 
     @property
     def about(self) -> str:
@@ -266,8 +266,8 @@ def read_envelope(message: bytes | str | Mapping[str, Any]) -> Envelope:
     envelope = message if isinstance(message, (dict, Mapping)) else json_object(message, "envelope")
     check_version(envelope, BATCH_VERSION)
     codec = envelope.get("codec")
-    if codec not in (CODEC, SERIALIZED_CODEC):
-        raise ContractError(f"codec must be {CODEC} or {SERIALIZED_CODEC}, got {shown(codec)}")
+    if codec not in CODECS:
+        raise ContractError(f"codec must be {', '.join(CODECS[:-1])} or {CODECS[-1]}, got {shown(codec)}")
     first_us, boot, seq = batch_id(envelope.get(BATCH))
     n = integer(envelope, SAMPLES)
     nonfinite = check_nonfinite(integer(envelope, NONFINITE)) if NONFINITE in envelope else 0

@@ -1,9 +1,9 @@
 """Serialized messages as columns and back: one sample per message, and the exact bytes again.
 
 A message of numbers only, after its header (`Decoder.flat`), is written as columns, which take half the bytes
-of the compressed message; its header is stored beside them. The writer rebuilds the messages and compares
-them. If any bit differs (a NaN's, a negative zero's), or the numbers do not become steps, the messages are
-stored unchanged.
+of the compressed message; its header is stored beside them, and in ROS 2 the bytes that are no number's. The
+writer rebuilds the messages and compares them. If any bit differs (a NaN's, a negative zero's), or the
+numbers do not become steps, the messages are stored unchanged.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from iort_contract.limits import (
     MessageError,
     Value,
 )
-from iort_contract.ros.decode import HEADER, Decoder
+from iort_contract.ros.decode import CDR_HEADER, HEADER, Decoder
 from iort_contract.ros.definition import parse
 from iort_contract.ros.message import MAX_LAYOUT, Messages
+from iort_contract.ros.plan import CDR_LITTLE, CDR_START, Run, fits
 
 _NS = 1_000_000_000
 # The limit for all frame_ids of a batch; messages with longer ones are stored unchanged.
@@ -49,7 +50,7 @@ def decoder_of(layout: str) -> Decoder:
 
 def values_a_message(messages: Messages) -> int:
     """The estimated number of values per message, by the longest."""
-    if not messages.layout:
+    if not messages.readable:
         return 0
     try:
         return len(decoder_of(messages.layout).decode(max(messages.raw, key=len)))
@@ -60,7 +61,7 @@ def values_a_message(messages: Messages) -> int:
 def view(messages: Messages) -> tuple[dict[str, list[Value]], int]:
     """The messages' samples as columns, with None for a missing field; and the number of values that are
     not finite."""
-    if not messages.layout:
+    if not messages.readable:
         return {}, 0
     decoder = decoder_of(messages.layout)
     numbers = _numbers(decoder, messages.raw)
@@ -97,7 +98,7 @@ def _walked(decoder: Decoder, raws: Sequence[bytes]) -> dict[str, list[Value]]:
 def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, list[Value]], str] | None:
     """Messages as `packed` columns, and the rest needed to rebuild them, as JSON. None if the messages are
     better stored unchanged."""
-    if not messages.layout:
+    if not messages.readable:
         return None
     decoder = decoder_of(messages.layout)
     numbers = _numbers(decoder, messages.raw)
@@ -111,24 +112,38 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
         # Numbers that are not steps take more as text than as bytes.
         if written[name][0] is None and float in set(map(type, columns[name])):
             return None
-    if numbers.rows != _rows(numbers.struct, numbers.names, columns):
-        return None
+    rows = _rows(numbers.readers, numbers.names, columns)
     about: list[Any] = [messages.type_id]
-    if decoder.stamped:
-        heads = [HEADER.unpack_from(raw) for raw in messages.raw]
-        frames = [raw[HEADER.size : HEADER.size + head[3]] for raw, head in zip(messages.raw, heads)]
-        try:
-            texts = [frame.decode() for frame in frames]
-        except UnicodeDecodeError:
-            return None
-        offsets = [sec * _NS + ns - 1000 * t_us for t_us, (_, sec, ns, _) in zip(times_us, heads)]
-        if any(ns >= _NS for _, _, ns, _ in heads) or sum(map(len, frames)) > _MAX_FRAMES:
-            return None
-        seqs = [head[0] for head in heads]
-        about.append(seqs[0] if seqs == list(range(seqs[0], seqs[0] + len(seqs))) else packed(seqs))
-        about.append(_digits(offsets) or packed(offsets))
-        about.append(texts if len(set(texts)) > 1 else texts[0])
-    return written, COMPACT.encode(about)
+    if decoder.ros2:
+        rests = _rests(decoder, numbers, messages.raw)
+        rows = _completed(decoder, numbers.starts, rows, rests)
+        about.append(_once([rest.hex() for rest in rests]))
+    if rows != numbers.bodies:
+        return None
+    head = _about_heads(decoder, messages.raw, numbers.starts, times_us) if decoder.stamped else []
+    return None if head is None else (written, COMPACT.encode([*about, *head]))
+
+
+def _about_heads(
+    decoder: Decoder, raws: Sequence[bytes], starts: Sequence[int], times_us: Sequence[int]
+) -> list[Any] | None:
+    """What is needed to rebuild the headers; None if that would be too much."""
+    heads = [(CDR_HEADER if decoder.ros2 else HEADER).unpack_from(raw) for raw in raws]
+    first = (CDR_HEADER if decoder.ros2 else HEADER).size
+    # In ROS 2, a text ends with a NUL.
+    frames = [raw[first : start - decoder.ros2] for raw, start in zip(raws, starts)]
+    try:
+        texts = [frame.decode() for frame in frames]
+    except UnicodeDecodeError:
+        return None
+    offsets = [sec * _NS + ns - 1000 * t_us for t_us, (*_, sec, ns, _) in zip(times_us, heads)]
+    if any(ns >= _NS for *_, ns, _ in heads) or sum(map(len, frames)) > _MAX_FRAMES:
+        return None
+    about: list[Any] = [_digits(offsets) or packed(offsets), _once(texts)]
+    if decoder.ros2:
+        return about
+    seqs = [head[0] for head in heads]
+    return [seqs[0] if seqs == list(range(seqs[0], seqs[0] + len(seqs))) else packed(seqs), *about]
 
 
 def from_columns(
@@ -146,35 +161,63 @@ def from_columns(
         decoder = decoder_of(layouts[name])
         if decoder.flat is None:
             raise ContractError(f"type {name} must consist of numbers")
-        rows, size = _rows(*decoder.flat, columns), decoder.flat[0].size
-        if len(rows) != n * size:
+        names = decoder.flat.named("")[1]
+        if columns.keys() != set(names):
             raise ContractError(f"the columns do not fit the type {name}")
-        raw = [rows[i * size : (i + 1) * size] for i in range(n)]
+        rests = [b""] * n
+        if decoder.ros2:
+            rests = list(map(bytes.fromhex, _each(head.pop(0), n, "the rest")))
+        heads = [rest[:CDR_START] for rest in rests]
         if decoder.stamped:
-            seq, stamp, frame = head
-            seqs = range(seq, seq + n) if type(seq) is int else unpacked("seq", seq, n)
-            offsets: Sequence[Any] = (
-                [int(stamp[3 * i : 3 * i + 3]) for i in range(n)]
-                if isinstance(stamp, str)
-                else unpacked("stamp", stamp, n)
-            )
-            # A single value stands for all messages.
-            texts = [frame] * n if isinstance(frame, str) else frame
-            if not isinstance(texts, list) or len(texts) != n or sum(map(len, texts)) > _MAX_FRAMES:
-                raise ContractError(f"frame_id must be {n} texts of at most {_MAX_FRAMES} characters")
-            heads = map(_head, seqs, times_us, offsets, texts)
-            raw = [start + body for start, body in zip(heads, raw)]
-    except (AttributeError, RecursionError, TypeError, ValueError, struct.error) as error:
+            heads = _heads(heads, head, times_us)
+        starts = list(map(len, heads))
+        rows = _rows(_readers(decoder.flat, starts, ros2=decoder.ros2), names, columns)
+        if len(rows) != n:
+            raise ContractError(f"the columns do not fit the type {name}")
+        if decoder.ros2:
+            rows = _completed(decoder, starts, rows, rests)
+        raw = [start + body for start, body in zip(heads, rows)]
+    except (AttributeError, IndexError, RecursionError, TypeError, ValueError, struct.error) as error:
         if isinstance(error, ContractError):
             raise
         raise ContractError(f"the messages cannot be rebuilt: {error}") from error
     return Messages(name, layouts[name], raw)
 
 
-def _head(seq: Any, t_us: int, offset_ns: Any, frame: str) -> bytes:
-    sec, nanosec = divmod(t_us * 1000 + offset_ns, _NS)
-    text = str.encode(frame)
-    return HEADER.pack(seq, sec, nanosec, len(text)) + text
+def _heads(starts: Sequence[bytes], about: Sequence[Any], times_us: Sequence[int]) -> list[bytes]:
+    """The headers, each behind the start of its message; ROS 1 has no start, and a seq in the header."""
+    n = len(times_us)
+    *seq, stamp, frame = about
+    offsets: Sequence[Any] = (
+        [int(stamp[3 * i : 3 * i + 3]) for i in range(n)]
+        if isinstance(stamp, str)
+        else unpacked("stamp", stamp, n)
+    )
+    times = [divmod(t_us * 1000 + offset_ns, _NS) for t_us, offset_ns in zip(times_us, offsets)]
+    contents = list(map(str.encode, _each(frame, n, "frame_id")))
+    if seq:
+        seqs = range(seq[0], seq[0] + n) if type(seq[0]) is int else unpacked("seq", seq[0], n)
+        return [
+            HEADER.pack(number, sec, nanosec, len(content)) + content
+            for number, (sec, nanosec), content in zip(seqs, times, contents)
+        ]
+    return [
+        start + CDR_HEADER.pack(sec, nanosec, len(content) + 1)[CDR_START:] + content + b"\0"
+        for start, (sec, nanosec), content in zip(starts, times, contents)
+    ]
+
+
+def _once(texts: list[str]) -> str | list[str]:
+    """A single text for all messages, if they are equal."""
+    return texts if len(set(texts)) > 1 else texts[0]
+
+
+def _each(texts: Any, n: int, what: str) -> list[str]:
+    """Undo `_once`."""
+    each = [texts] * n if isinstance(texts, str) else texts
+    if not isinstance(each, list) or len(each) != n or sum(map(len, each)) > _MAX_FRAMES:
+        raise ContractError(f"{what} must be {n} texts of at most {_MAX_FRAMES} characters")
+    return each
 
 
 def _digits(offsets: Sequence[int]) -> str:
@@ -185,35 +228,90 @@ def _digits(offsets: Sequence[int]) -> str:
 
 
 class _Numbers(NamedTuple):
-    """Messages of numbers only, without their headers: one struct for each, and the names of its numbers."""
+    """Messages of numbers only: where the numbers begin, the bytes from there on, a struct for each message,
+    and the names of the numbers."""
 
-    struct: struct.Struct
+    starts: Sequence[int]
+    bodies: list[bytes]
+    readers: Sequence[struct.Struct]
     names: Sequence[str]
-    rows: bytes
 
     def columns(self) -> dict[str, list[Value]]:
         """The numbers by name."""
-        return dict(zip(self.names, map(list, zip(*self.struct.iter_unpack(self.rows)))))
+        reader = self.readers[0]
+        if len(set(self.readers)) == 1 and set(map(len, self.bodies)) == {reader.size}:
+            rows = reader.iter_unpack(b"".join(self.bodies))
+        else:
+            rows = (reader.unpack_from(body) for reader, body in zip(self.readers, self.bodies))
+        return dict(zip(self.names, map(list, zip(*rows))))
 
 
 def _numbers(decoder: Decoder, raws: Sequence[bytes]) -> _Numbers | None:
     """The messages' numbers; None if there is anything else, or if a message has another length."""
     if decoder.flat is None:
         return None
-    reader, names = decoder.flat
     try:
-        starts = [HEADER.size + HEADER.unpack_from(raw)[3] if decoder.stamped else 0 for raw in raws]
+        starts = [decoder.body(raw) if decoder.stamped else CDR_START * decoder.ros2 for raw in raws]
     except struct.error:
         return None
+    readers = _readers(decoder.flat, starts, ros2=decoder.ros2)
     bodies = [raw[start:] for raw, start in zip(raws, starts)]
-    return _Numbers(reader, names, b"".join(bodies)) if set(map(len, bodies)) == {reader.size} else None
+    fit = all(len(body) == reader.size for reader, body in zip(readers, bodies))
+    if decoder.ros2:
+        first = CDR_HEADER.size
+        fit = all(
+            raw[:2] == CDR_LITTLE
+            and (not decoder.stamped or raw[start - 1 : start] == b"\0" < raw[first - 4 : first])
+            and fits(start + reader.size, len(raw), ros2=True)
+            for raw, start, reader in zip(raws, starts, readers)
+        )
+    return _Numbers(starts, bodies, readers, decoder.flat.named("")[1]) if fit else None
 
 
-def _rows(writer: struct.Struct, names: Sequence[str], columns: Mapping[str, Sequence[Value]]) -> bytes:
-    """The messages without their headers, joined; empty if a value does not fit."""
-    if columns.keys() != set(names):
-        return b""
+def _readers(run: Run, starts: Sequence[int], *, ros2: bool) -> list[struct.Struct]:
+    if not ros2:
+        return [run.named("")[0]] * len(starts)
+    return [run.named("", start % 8)[0] for start in starts]
+
+
+def _rows(
+    writers: Sequence[struct.Struct], names: Sequence[str], columns: Mapping[str, Sequence[Value]]
+) -> list[bytes]:
+    """The messages without their headers; empty if a value does not fit."""
     try:
-        return b"".join([writer.pack(*row) for row in zip(*(columns[name] for name in names))])
+        rows = zip(*(columns[name] for name in names))
+        return [writer.pack(*row) for writer, row in zip(writers, rows)]
     except (struct.error, OverflowError):
-        return b""
+        return []
+
+
+# What a message of ROS 2 has beside its header and its numbers: its start, the bytes of its gaps, and those
+# that fill it up.
+
+
+def _rests(decoder: Decoder, numbers: _Numbers, raws: Sequence[bytes]) -> list[bytes]:
+    assert decoder.flat is not None
+    rests = []
+    for raw, start, reader in zip(raws, numbers.starts, numbers.readers):
+        gaps = bytes([raw[start + gap] for gap in decoder.flat.gaps(start % 8)])
+        rests.append(raw[:CDR_START] + gaps + raw[start + reader.size :])
+    return rests
+
+
+def _completed(
+    decoder: Decoder, starts: Sequence[int], rows: Sequence[bytes], rests: Sequence[bytes]
+) -> list[bytes]:
+    """The rows with what they have beside their numbers."""
+    assert decoder.flat is not None
+    completed = []
+    for start, row, rest in zip(starts, rows, rests):
+        gaps = decoder.flat.gaps(start % 8)
+        end = CDR_START + len(gaps)
+        if any(rest[CDR_START:end]):
+            content = bytearray(row)
+            for gap, byte in zip(gaps, rest[CDR_START:]):
+                content[gap] = byte
+            completed.append(bytes(content) + rest[end:])
+        else:
+            completed.append(row + rest[end:])
+    return completed

@@ -1,14 +1,13 @@
-"""Decodes a ROS 1 message to a flat sample, by its definition: field path -> value.
+"""Decodes a message of ROS 1 or ROS 2 to a flat sample, by its definition: field path -> value.
 
-This is the only rule of flattening. Nested messages give dotted paths and arrays give indexes:
-``pose.position.x``, ``covariance.0``. Time and duration become ``sec`` and ``nanosec``, as in ROS 2. A
-leading header is left out, because its stamp is the sample's time. A message of a header and exactly one
-nested message (VescStateStamped, PoseStamped) gives that message's fields without a prefix.
+This is the only rule of flattening, and both have the same paths. Nested messages give dotted paths and
+arrays give indexes: ``pose.position.x``, ``covariance.0``. Time and duration become ``sec`` and ``nanosec``,
+as in ROS 2. A leading header is left out, because its stamp is the sample's time. A message of a header and
+exactly one nested message (VescStateStamped, PoseStamped) gives that message's fields without a prefix.
 
 The sample is a view; the record holds the message. The view leaves out and counts the fields that no table
 shows: arrays of more than `MAX_ELEMENTS`, ``uint8[]`` of any length, texts of more than `MAX_TEXT`
-characters, fields beyond `MAX_FIELDS`. `Types` compiles each type once: neighbouring numbers become one
-`struct.Struct`.
+characters, fields beyond `MAX_FIELDS`.
 """
 
 from __future__ import annotations
@@ -17,10 +16,33 @@ import re
 import struct
 from functools import lru_cache
 from itertools import islice
-from typing import Callable, Dict, Iterator, NamedTuple, Sequence, Tuple, Union
+from typing import Dict, Sequence
 
 from iort_contract.limits import MAX_FIELDS, MessageError, Value
-from iort_contract.ros.definition import LETTERS, STRING, VARIABLE, Definition, Field, Fields
+from iort_contract.ros.definition import (
+    LETTERS,
+    STRING,
+    TEXTS,
+    VARIABLE,
+    Definition,
+    Field,
+    Fields,
+    short_kind,
+)
+from iort_contract.ros.plan import (
+    CDR_BIG,
+    CDR_LITTLE,
+    CDR_START,
+    MAX_ELEMENTS,
+    SIZES,
+    Part,
+    Run,
+    Types,
+    cdr_order,
+    cdr_text,
+    fits,
+    padding,
+)
 
 MAX_TEXT = 4096
 # A message with more elements of variable size in one array is not decoded.
@@ -31,132 +53,28 @@ _MAX_FIXED_BYTES = 2**31
 _MAX_SEARCHED = 20_000
 _MAX_CACHED = 1000
 
-# An array of more elements is not shown, and read apart from its neighbours.
-MAX_ELEMENTS = 64
-_MAX_PREFIXES = 1000
-
 # A header begins with seq, the stamp's seconds and nanoseconds, and the length of the frame_id.
 HEADER = struct.Struct("<IIII")
+# In ROS 2 it has no seq, and the bytes that tell the byte order are before it.
+CDR_HEADER = struct.Struct("<4xiII")
+_CDR_STAMPS = {CDR_LITTLE: struct.Struct("<4xiI"), CDR_BIG: struct.Struct(">4xiI")}
 _LENGTH = struct.Struct("<I")
 _BLOBS = ("uint8", "char")
 _BEYOND = f"(fields beyond {MAX_FIELDS})"
 
 
-def stamp_ns(message: bytes) -> int | None:
+def stamp_ns(data: bytes, *, ros2: bool = False) -> int | None:
     """The header stamp of a stamped message; None if the message is too short to have one."""
-    if len(message) < HEADER.size:
+    if ros2:
+        stamp = _CDR_STAMPS.get(data[:2])
+        if stamp is None or len(data) < CDR_HEADER.size:
+            return None
+        sec, nanosec = stamp.unpack_from(data)
+    elif len(data) < HEADER.size:
         return None
-    _, sec, nanosec, _ = HEADER.unpack_from(message)
+    else:
+        _, sec, nanosec, _ = HEADER.unpack_from(data)
     return int(sec) * 1_000_000_000 + int(nanosec)
-
-
-class Extent(NamedTuple):
-    """The bytes of a value of fixed size, and how many numbers it has."""
-
-    size: int
-    numbers: int
-
-
-_NUMBERS = {kind: Extent(struct.calcsize(f"<{letter}"), 1) for kind, letter in LETTERS.items()}
-# A number's kind and its path.
-_Leaf = Tuple[str, str]
-
-
-class Run:
-    """Neighbouring numbers, read by one `struct.Struct`, which the first sample that needs it creates."""
-
-    def __init__(self, fields: Fields, extent: Extent, types: Types) -> None:
-        self.size, self.numbers = extent
-        self._fields = fields
-        self._types = types
-        self._leaves: list[_Leaf] | None = None
-        self._named: dict[str, tuple[struct.Struct, list[str]]] = {}
-
-    def named(self, prefix: str) -> tuple[struct.Struct, list[str]]:
-        """The struct that reads the wanted numbers, and their paths."""
-        if prefix not in self._named:
-            if self._leaves is None:
-                self._leaves = [leaf for field in self._fields for leaf in self._expand(field, field.name)]
-            if len(self._named) >= _MAX_PREFIXES:
-                self._named.clear()
-            names, letters = [], []
-            for kind, path in self._leaves:
-                if self._types.wanted(prefix + path):
-                    names.append(prefix + path)
-                    letters.append(LETTERS[kind])
-                else:
-                    letters.append(f"{_NUMBERS[kind].size}x")
-            self._named[prefix] = struct.Struct("<" + "".join(letters)), names
-        return self._named[prefix]
-
-    def _expand(self, field: Field, path: str) -> Iterator[_Leaf]:
-        extent = self._types.extent_of(field)
-        # A type without numbers may have any number of fields.
-        if extent is None or not extent.numbers:
-            return
-        for i in range(1 if field.length is None else field.length):
-            here = path if field.length is None else f"{path}.{i}"
-            if field.kind in LETTERS:
-                yield field.kind, here
-            for nested in self._types.fields.get(field.kind, ()):
-                yield from self._expand(nested, f"{here}.{nested.name}")
-
-
-# A `Run`, or a field that is read by itself: a text, an array, a message of variable size.
-Part = Union[Run, Field]
-
-
-class Types:
-    """The types of a definition, each compiled once. ``wanted`` tells whether a path is selected."""
-
-    def __init__(self, fields: dict[str, Fields], wanted: Callable[[str], bool]) -> None:
-        self.fields = fields
-        self.wanted = wanted
-        self._extents: dict[str, Extent | None] = {**_NUMBERS, STRING: None}
-        self._parts: dict[str, list[Part]] = {}
-
-    def parts(self, kind: str) -> list[Part]:
-        """The parts of a type."""
-        if kind not in self._parts:
-            self._parts[kind] = self.compile(self.fields[kind])
-        return self._parts[kind]
-
-    def compile(self, fields: Fields) -> list[Part]:
-        """The parts of some fields."""
-        parts: list[Part] = []
-        run: list[Field] = []
-        size = numbers = 0
-        for field in fields:
-            extent = self.extent_of(field)
-            if extent is not None and extent.numbers <= MAX_FIELDS:
-                run.append(field)
-                size, numbers = size + extent.size, numbers + extent.numbers
-                continue
-            if run:
-                parts.append(Run(tuple(run), Extent(size, numbers), self))
-                run, size, numbers = [], 0, 0
-            parts.append(field)
-        return [*parts, Run(tuple(run), Extent(size, numbers), self)] if run else parts
-
-    def extent(self, kind: str) -> Extent | None:
-        """The extent of a type; None if its size varies."""
-        if kind not in self._extents:
-            extents = [self.extent_of(field) for field in self.fields[kind]]
-            fixed = [extent for extent in extents if extent is not None]
-            whole = Extent(sum(extent.size for extent in fixed), sum(extent.numbers for extent in fixed))
-            self._extents[kind] = whole if len(fixed) == len(extents) else None
-        return self._extents[kind]
-
-    def extent_of(self, field: Field) -> Extent | None:
-        """The extent of a field; None if its size varies."""
-        if field.length == 0:
-            return Extent(0, 0)
-        extent = None if field.length == VARIABLE else self.extent(field.kind)
-        if extent is None or field.length is None:
-            return extent
-        # A long array is read apart, because its elements are left out.
-        numbers = extent.numbers * field.length if field.length <= MAX_ELEMENTS else MAX_FIELDS + 1
-        return Extent(extent.size * field.length, numbers)
 
 
 class Decoder:
@@ -167,14 +85,21 @@ class Decoder:
 
     ``stamped`` is true if messages begin with a header. ``unknown`` are selected paths that the message does
     not have. ``left_out`` counts the omitted values by path. ``walked`` counts the elements of variable size
-    that were read one by one, times their fields: the main cost of decoding. ``flat`` is the struct of a
-    message that has only numbers after its header, and their names; None for other messages.
+    that were read one by one, times their fields: the main cost of decoding. ``flat`` are the numbers of a
+    message that has only numbers after its header; None for other messages. ``order`` is the byte order that
+    `struct` knows as ``<`` or ``>``; a message of ROS 2 may be of either.
     """
 
     def __init__(
-        self, definition: Definition, *, select: Sequence[str] | None = None, large: bool = False
+        self,
+        definition: Definition,
+        *,
+        select: Sequence[str] | None = None,
+        large: bool = False,
+        order: str = "<",
     ) -> None:
         self.stamped = definition.stamped()
+        self.ros2 = definition.ros2
         self.left_out: dict[str, int] = {}
         self.walked = 0
         self._kind = definition.kind
@@ -182,31 +107,45 @@ class Decoder:
         self._select = select
         self._large = large
         self._limit = MAX_FIELDS if select is None else _MAX_SEARCHED
-        self._compiled = Types(definition.types, self.wanted)
+        self._definition = definition
+        self._order = order
+        self._mask = 7 if self.ros2 else 0
+        self._length = struct.Struct(f"{order}I")
+        self._big_endian: Decoder | None = None
+        self._compiled = Types(definition.types, self.wanted, aligned=self.ros2, order=order)
         self._chosen: dict[str, bool] = {}
-        body = definition.fields()[1 if self.stamped else 0 :]
+        name = short_kind(self._kind)
+        fields = definition.fields()
+        body = fields[1:] if self.stamped else fields
+        extent = self._compiled.extent(name)
+        if extent is not None and extent.sizes[0] > _MAX_FIXED_BYTES:
+            raise MessageError(f"{self._kind}: the message would be too large: {extent.sizes[0]} bytes")
         if self.stamped and len(body) == 1 and body[0].length is None and body[0].kind in self._types:
-            body = self._types[body[0].kind]
-        extent = self._compiled.extent(self._kind)
-        if extent is not None and extent.size > _MAX_FIXED_BYTES:
-            raise MessageError(f"{self._kind}: the message would be too large: {extent.size} bytes")
-        self._body = self._compiled.compile(body)
+            name, body = body[0].kind, self._types[body[0].kind]
+            self._body = self._compiled.parts(name)
+        else:
+            self._body = self._compiled.compile(body) if self.stamped else self._compiled.parts(name)
         self.unknown = sorted(path for path in select or () if not self._has(path.split("."), body))
-        self.flat: tuple[struct.Struct, list[str]] | None = None
+        self.flat: Run | None = None
         if len(self._body) == 1 and isinstance(self._body[0], Run) and self._body[0].numbers <= MAX_FIELDS:
-            self.flat = self._body[0].named("") if self._body[0].numbers else None
+            self.flat = self._body[0] if self._body[0].numbers else None
 
     def decode(self, data: bytes) -> dict[str, Value]:
         """The message as a sample; raises `MessageError` if the bytes do not fit the definition."""
-        values: dict[str, Value] = {}
         at = 0
+        if self.ros2:
+            at = CDR_START
+            if data[:2] != CDR_LITTLE and self._order == "<":
+                return self._decode_big_endian(data)
+        values: dict[str, Value] = {}
         try:
             if self.stamped:
-                at = HEADER.size + HEADER.unpack_from(data)[3]
+                # The method costs more than what it does.
+                at = self.body(data) if self.ros2 else HEADER.size + HEADER.unpack_from(data)[3]
             at = self._read(self._body, "", data, at, values)
         except struct.error as error:
             raise MessageError(f"{self._kind}: the message of {len(data)} bytes is truncated") from error
-        if at != len(data):
+        if at != len(data) and not fits(at, len(data), ros2=self.ros2):
             raise MessageError(f"{self._kind}: the message must have {at} bytes, got {len(data)}")
         if self._select is not None:
             values = {path: value for path, value in values.items() if self.wanted(path)}
@@ -215,6 +154,24 @@ class Decoder:
             values = dict(islice(values.items(), MAX_FIELDS))
         return values
 
+    def _decode_big_endian(self, data: bytes) -> dict[str, Value]:
+        order = cdr_order(self._kind, data)
+        if self._big_endian is None:
+            self._big_endian = Decoder(self._definition, select=self._select, large=self._large, order=order)
+            self._big_endian.left_out = self.left_out
+        walked = self._big_endian.walked
+        try:
+            return self._big_endian.decode(data)
+        finally:
+            self.walked += self._big_endian.walked - walked
+
+    def body(self, data: bytes) -> int:
+        """The place behind the header of a stamped message; raises `struct.error` if it is too short."""
+        if self.ros2:
+            at = CDR_HEADER.size
+            return at + int(self._length.unpack_from(data, at - _LENGTH.size)[0])
+        return HEADER.size + int(HEADER.unpack_from(data)[3])
+
     # Reading. A path of None skips the value.
 
     def _read(self, parts: Sequence[Part], prefix: str | None, data: bytes, at: int, out: _Sample) -> int:
@@ -222,10 +179,12 @@ class Decoder:
             # The next values would be cut from a full sample.
             shown = prefix is not None and len(out) <= self._limit
             if isinstance(part, Run):
+                phase = at & self._mask
                 if shown:
-                    reader, names = part.named(prefix or "")
+                    # Here, too.
+                    reader, names = part.compiled[phase].get(prefix or "") or part.named(prefix or "", phase)
                     out.update(zip(names, reader.unpack_from(data, at)))
-                at += part.size
+                at += part.sizes[phase]
                 continue
             path = f"{prefix}{part.name}" if shown else None
             if part.length is None:
@@ -237,28 +196,50 @@ class Decoder:
     def _value(self, kind: str, path: str | None, data: bytes, at: int, out: _Sample) -> int:
         if kind in self._types:
             return self._read(self._compiled.parts(kind), None if path is None else f"{path}.", data, at, out)
-        if kind == STRING:
-            (n,) = _LENGTH.unpack_from(data, at)
+        if kind in TEXTS:
+            if self.ros2:
+                at += padding(at, 4)
+            (n,) = self._length.unpack_from(data, at)
+            at += 4
+            end = at + (n if kind == STRING else 4 * n)
             if path is not None:
-                # ROS 1 does not define the encoding of a text.
-                text = data[at + 4 : at + 4 + n].decode("utf-8", "replace") if n <= 4 * MAX_TEXT else None
+                text = None
+                if end - at <= 4 * MAX_TEXT:
+                    # Neither ROS defines the encoding of a text.
+                    content = data[at:end]
+                    text = (
+                        cdr_text(kind, content, self._order)
+                        if self.ros2
+                        else content.decode("utf-8", "replace")
+                    )
                 if text is None or len(text) > MAX_TEXT:
                     self._leave_out(path)
                 else:
                     out[path] = text
-            return at + 4 + int(n)
+            return int(end)
+        if self.ros2:
+            at += padding(at, SIZES[kind])
         assert path is not None
-        (out[path],) = struct.unpack_from(f"<{LETTERS[kind]}", data, at)
+        (out[path],) = struct.unpack_from(f"{self._order}{LETTERS[kind]}", data, at)
         return at
 
     def _array(self, field: Field, path: str | None, data: bytes, at: int, out: _Sample) -> int:
         kind, n = field.kind, field.length or 0
         blob = n == VARIABLE and kind in _BLOBS
         if n == VARIABLE:
-            (n,) = _LENGTH.unpack_from(data, at)
+            if self.ros2:
+                at += padding(at, 4)
+            (n,) = self._length.unpack_from(data, at)
             at += 4
         extent = self._compiled.extent(kind)
-        if extent is not None and at + n * extent.size > len(data):
+        size = 0
+        if kind in LETTERS:
+            if self.ros2 and n:
+                at += padding(at, SIZES[kind])
+            size = n * SIZES[kind]
+        elif extent is not None:
+            size = extent.times(n, at & self._mask)
+        if at + size > len(data):
             raise struct.error
         shown: Sequence[int] = ()
         if path is not None and blob and self._large:
@@ -270,13 +251,14 @@ class Decoder:
             self._leave_out(path)
         # Empty arrays are no fields, so nothing limits their number: they must not cost names.
         if n and kind in LETTERS and isinstance(shown, range):
-            out.update(zip(_element_names(path or ""), struct.unpack_from(f"<{n}{LETTERS[kind]}", data, at)))
+            letters = f"{self._order}{n}{LETTERS[kind]}"
+            out.update(zip(_element_names(path or ""), struct.unpack_from(letters, data, at)))
         elif extent is not None:
             for i in shown if extent.numbers else ():
                 if len(out) <= self._limit:
-                    self._value(kind, f"{path}.{i}", data, at + i * extent.size, out)
+                    self._value(kind, f"{path}.{i}", data, at + extent.times(i, at & self._mask), out)
         if extent is not None:
-            return at + n * extent.size
+            return at + size
         if n > _MAX_WALKED:
             raise MessageError(f"{path or kind}: too many elements to decode: {n}")
         self.walked += n * (len(self._compiled.parts(kind)) if kind in self._types else 1)

@@ -1,7 +1,9 @@
-"""Parses ROS 1 message definitions: the fields of a message, in the wire's order.
+"""Parses message definitions of ROS 1 and ROS 2: the fields of a message, in the wire's order.
 
-A publisher sends the text in its connection header, and a bag keeps it: the message's own definition, then
-each nested type's after a line of ``=`` and ``MSG: package/Type``.
+A ROS 1 publisher sends the text in its connection header, and a bag of either keeps it: the message's own
+definition, then each nested type's after a line of ``=`` and ``MSG: package/Type``. The form of the type's
+name says which ROS it is: ``sensor_msgs/Imu`` is ROS 1, ``sensor_msgs/msg/Imu`` is ROS 2. Nested types have
+the short form in both, so `HEADER_TYPE`, `TIME` and `DURATION` mean the same in both.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from typing import Iterator, NamedTuple, Tuple
 
 from iort_contract.limits import MessageError
 
-# Builtin type -> its letter in `struct`. A ROS 1 char is an unsigned byte, a byte a signed one.
+# Builtin type -> its letter in `struct`. A char is an unsigned byte, and ROS 2's ``byte`` becomes one.
 LETTERS = {
     "bool": "?",
     "int8": "b",
@@ -28,26 +30,45 @@ LETTERS = {
     "float32": "f",
     "float64": "d",
 }
-STRING, TIME, DURATION, HEADER_TYPE = "string", "time", "duration", "std_msgs/Header"
+STRING, WSTRING, TIME, DURATION = "string", "wstring", "time", "duration"
+TEXTS = (STRING, WSTRING)
+HEADER_TYPE = "std_msgs/Header"
 VARIABLE = -1
 
 _SEPARATOR = re.compile(r"^={20,}\s*$", re.MULTILINE)
-_LINE = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)", re.ASCII)
+_LINE = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d{0,12})\])?\s+([A-Za-z]\w*)\s*(=?)", re.ASCII)
+# ROS 2 has bounds, and defaults after the name.
+_ROS2_LINE = re.compile(
+    r"([A-Za-z][\w/]*)(?:<=(\d{1,12}))?(?:\[(<=)?(\d{0,12})\])?\s+([A-Za-z]\w*)(?:\s*(=)|\s+\S|$)", re.ASCII
+)
+# rosidl gives an empty message this field, so that it has a byte; it is no field of ours.
+_FILLER = "structure_needs_at_least_one_member"
 # Limits of nesting and of fields, beyond all messages in use.
 _MAX_DEPTH, _MAX_TYPES, _MAX_ARRAY = 32, 256, 2**24
 
 
 class Field(NamedTuple):
-    """A field: ``length`` is None for a single value, `VARIABLE`, or the length of a fixed array."""
+    """A field: ``length`` is None for a single value, `VARIABLE`, or the length of a fixed array.
+
+    ROS 2 bounds texts to ``longest`` characters, and arrays of variable length to ``most`` elements.
+    """
 
     name: str
     kind: str
     length: int | None
+    most: int | None = None
+    longest: int | None = None
 
     def __str__(self) -> str:
         """The field's line in a definition."""
-        length = "" if self.length is None else "[]" if self.length == VARIABLE else f"[{self.length}]"
-        return f"{self.kind}{length} {self.name}"
+        longest = "" if self.longest is None else f"<={self.longest}"
+        most = "" if self.most is None else f"<={self.most}"
+        length = "" if self.length is None else f"[{most}]" if self.length == VARIABLE else f"[{self.length}]"
+        return f"{self.kind}{longest}{length} {self.name}"
+
+    def element(self) -> Field:
+        """An element of an array."""
+        return Field(self.name, self.kind, None, None, self.longest)
 
 
 Fields = Tuple[Field, ...]
@@ -56,17 +77,34 @@ TIMES = {
     TIME: (Field("sec", "uint32", None), Field("nanosec", "uint32", None)),
     DURATION: (Field("sec", "int32", None), Field("nanosec", "int32", None)),
 }
+_ROS2_TIME = (Field("sec", "int32", None), Field("nanosec", "uint32", None))
+_ROS2_TIMES = {"builtin_interfaces/Time": TIME, "builtin_interfaces/Duration": DURATION}
+
+
+def is_ros2(kind: str) -> bool:
+    """Whether a type's name has the form of ROS 2: ``package/msg/Type``."""
+    return kind.count("/") == 2
+
+
+def short_kind(kind: str) -> str:
+    """The name that a type has in both: ``package/Type``."""
+    return f"{kind[: kind.index('/')]}{kind[kind.rindex('/') :]}" if is_ros2(kind) else kind
 
 
 class Definition(NamedTuple):
-    """A message type and every type in it."""
+    """A message type, under its name in its own ROS, and every type in it, under the short names."""
 
     kind: str
     types: dict[str, Fields]
 
+    @property
+    def ros2(self) -> bool:
+        """Whether it is a type of ROS 2."""
+        return is_ros2(self.kind)
+
     def fields(self, kind: str | None = None) -> Fields:
         """The fields of a nested type, or of the message itself."""
-        return self.types[kind or self.kind]
+        return self.types[kind or short_kind(self.kind)]
 
     def stamped(self) -> bool:
         """Whether the message begins with a header, as ROS requires."""
@@ -76,25 +114,33 @@ class Definition(NamedTuple):
 
 def parse(kind: str, text: str) -> Definition:
     """Parse a definition; raises `MessageError` if it is invalid."""
-    definition = Definition(kind, {**TIMES})
+    definition = Definition(kind, {TIME: _ROS2_TIME, DURATION: _ROS2_TIME} if is_ros2(kind) else {**TIMES})
+    fields = _ros2_fields if definition.ros2 else _fields
     for name, body in _sections(kind, text):
-        definition.types[name] = tuple(_fields(name, body))
-    _check(definition, kind, (), set())
+        definition.types[name] = tuple(fields(name, body))
+    _check(definition, short_kind(kind), (), set())
     return definition
 
 
 def layout(definition: Definition) -> str:
     """The definition without comments and constants, in a form that `parse` reads: enough for decoding."""
-    order = [definition.kind]
+    written = {kind: name for name, kind in _ROS2_TIMES.items()} if definition.ros2 else {}
+    order = [short_kind(definition.kind)]
     for kind in order:
         nested = {field.kind: None for field in definition.types[kind]}
         order += [name for name in nested if "/" in name and name not in order]
-    first, *others = ("".join(f"{field}\n" for field in definition.types[kind]) for kind in order)
+    first, *others = (
+        "".join(
+            f"{field._replace(kind=written.get(field.kind, field.kind))}\n"
+            for field in definition.types[kind]
+        )
+        for kind in order
+    )
     return first + "".join(f"{'=' * 80}\nMSG: {kind}\n{body}" for kind, body in zip(order[1:], others))
 
 
 def md5sum(definition: Definition, text: str) -> str:
-    """ROS' MD5 of a definition with this text: of the constants, then the fields, a nested type by its
+    """ROS 1's MD5 of a definition with this text: of the constants, then the fields, a nested type by its
     MD5."""
     done: dict[str, str] = {}
     bodies = dict(_sections(definition.kind, text))
@@ -133,8 +179,8 @@ def _sections(kind: str, text: str) -> Iterator[tuple[str, str]]:
         name = head[len("MSG:") :].strip() if head.startswith("MSG:") else ""
         if "/" not in name:
             raise MessageError(f"{kind}: a nested type must begin with MSG: package/Type, got {head[:60]!r}")
-        yield name, body
-    yield kind, first
+        yield short_kind(name), body
+    yield short_kind(kind), first
 
 
 def _fields(kind: str, text: str) -> Iterator[Field]:
@@ -156,12 +202,40 @@ def _fields(kind: str, text: str) -> Iterator[Field]:
         yield Field(name, base, None if length is None else int(length or VARIABLE))
 
 
+def _ros2_fields(kind: str, text: str) -> Iterator[Field]:
+    package = kind.partition("/")[0]
+    for line in text.splitlines():
+        stripped = line.split("#", 1)[0].strip()
+        match = _ROS2_LINE.match(stripped)
+        if match is None:
+            if stripped:
+                raise MessageError(f"{kind}: the definition has an invalid line {stripped[:60]!r}")
+            continue
+        base, longest, bounded, length, name, constant = match.groups()
+        if constant or name == _FILLER:
+            continue
+        if (bounded and not length) or (longest and base not in TEXTS):
+            raise MessageError(f"{kind}: the definition has an invalid line {stripped[:60]!r}")
+        if length and not bounded and int(length) > _MAX_ARRAY:
+            raise MessageError(f"{kind}: {name} has {length} elements")
+        base = short_kind(base)
+        if base == "byte":
+            base = "char"
+        elif base == "Header":
+            base = HEADER_TYPE
+        elif "/" not in base and base not in LETTERS and base not in (*TEXTS, TIME, DURATION):
+            base = f"{package}/{base}"
+        size = None if length is None else VARIABLE if bounded else int(length or VARIABLE)
+        bounds = (int(length) if bounded else None, int(longest) if longest else None)
+        yield Field(name, _ROS2_TIMES.get(base, base), size, *bounds)
+
+
 def _check(definition: Definition, kind: str, within: tuple[str, ...], good: set[str]) -> None:
     if kind in within or len(within) > _MAX_DEPTH:
         raise MessageError(f"{definition.kind}: {kind} contains itself, or is nested too deeply")
     if kind not in definition.types:
         raise MessageError(f"{definition.kind}: the definition of {kind} is missing")
     for nested in {field.kind for field in definition.types[kind]} - good:
-        if nested not in LETTERS and nested != STRING:
+        if nested not in LETTERS and nested not in TEXTS:
             _check(definition, nested, (*within, kind), good)
     good.add(kind)

@@ -7,13 +7,15 @@ import struct
 from typing import Any, Iterator, Mapping, NamedTuple, Sequence, ValuesView
 
 from iort_contract.checks import COMPACT, json_object, shown
+from iort_contract.codec import ROS1_CODEC, ROS2_CODEC
 from iort_contract.limits import MAX_COLUMNS_BYTES, MAX_SERIALIZED_BYTES, ContractError, MessageError, Value
 from iort_contract.ros.decode import Decoder, Large
-from iort_contract.ros.definition import layout, parse
+from iort_contract.ros.definition import is_ros2, layout, parse
+from iort_contract.ros.plan import CDR_BIG
 
 # The size limit of a layout in a batch; ROS definitions have some thousand characters.
 MAX_LAYOUT = 64 * 1024
-_LENGTH = struct.Struct("<I")
+_LENGTH, _BIG_LENGTH = struct.Struct("<I"), struct.Struct(">I")
 
 
 def type_id(topic: str, kind: str, md5sum: str) -> str:
@@ -23,16 +25,20 @@ def type_id(topic: str, kind: str, md5sum: str) -> str:
 
 
 class RosType:
-    """The type of a topic's messages: ``definition`` is the text that a publisher sends.
+    """The type of a topic's messages: ``definition`` is the text that a publisher sends, or that a package of
+    ROS 2 has.
 
     ``decoder`` is None if the definition is invalid, and ``error`` then says why; its messages are still
-    recorded. ``layout`` is the definition as a batch carries it, or empty.
+    recorded. ``layout`` is the definition as a batch carries it; of an invalid one it is empty in ROS 1, and
+    the type's name alone in ROS 2.
     """
 
     def __init__(self, topic: str, kind: str, md5sum: str, definition: str) -> None:
         self.id = type_id(topic, kind, md5sum)
+        self.ros2 = is_ros2(kind)
         self.decoder: Decoder | None = None
-        self.layout = self.error = ""
+        self.layout = kind if self.ros2 else ""
+        self.error = ""
         try:
             parsed = parse(kind, definition)
             written = f"{kind}\n{layout(parsed)}"
@@ -96,20 +102,29 @@ class RosMessage(Mapping[str, Value]):
         return self._values
 
 
-def cut(raw: bytes, content: Large, removed: int = 0) -> tuple[bytes, int]:
+def cut(raw: bytes, content: Large, removed: int = 0, *, ros2: bool = False) -> tuple[bytes, int]:
     """The message with an empty array in place of ``content``, and its position; `filled` undoes it.
 
-    ``removed`` are the bytes that were cut out before, in front of it.
+    ``removed`` are the bytes that were cut out before, in front of it. In a message of ROS 2, up to 7 bytes
+    stay, so that what follows stays aligned and can be decoded.
     """
     at = content.at - removed
-    return raw[:at] + _LENGTH.pack(0) + raw[at + 4 + len(content) :], at
+    left = content[: len(content) % 8 if ros2 else 0]
+    return raw[:at] + _length(raw, ros2=ros2).pack(len(left)) + left + raw[at + 4 + len(content) :], at
 
 
-def filled(raw: bytes, content: bytes, at: int) -> bytes:
-    """Undo `cut`; raises `MessageError` if the message has no empty array there."""
-    if raw[at : at + 4] != _LENGTH.pack(0):
+def filled(raw: bytes, content: bytes, at: int, *, ros2: bool = False) -> bytes:
+    """Undo `cut`; raises `MessageError` if the message has no such array there."""
+    length = _length(raw, ros2=ros2)
+    left = content[: len(content) % 8 if ros2 else 0]
+    end = at + 4 + len(left)
+    if raw[at:end] != length.pack(len(left)) + left:
         raise MessageError(f"the message has no empty array at byte {at}")
-    return raw[:at] + _LENGTH.pack(len(content)) + content + raw[at + 4 :]
+    return raw[:at] + length.pack(len(content)) + content + raw[end:]
+
+
+def _length(raw: bytes, *, ros2: bool) -> struct.Struct:
+    return _BIG_LENGTH if ros2 and raw.startswith(CDR_BIG) else _LENGTH
 
 
 class Messages(NamedTuple):
@@ -118,6 +133,16 @@ class Messages(NamedTuple):
     type_id: str
     layout: str
     raw: Sequence[bytes]
+
+    @property
+    def readable(self) -> bool:
+        """Whether the layout has a definition."""
+        return bool(self.layout) and ("\n" in self.layout or not is_ros2(self.layout))
+
+    @property
+    def codec(self) -> str:
+        """The codec of a batch that keeps them unchanged."""
+        return ROS2_CODEC if is_ros2(self.layout.partition("\n")[0]) else ROS1_CODEC
 
 
 # Longer messages differ in more than they share.
@@ -189,12 +214,13 @@ ROS2 = "ros2"
 
 
 class MessageType(NamedTuple):
-    """The ROS 1 type of a stream's messages.
+    """The type of a stream's messages.
 
     A source sends it once a run, as a sample of the stream `TYPES_STREAM`; readers need it to rebuild the
-    messages. ``kind`` is in ROS 1's form, ``package/Type``; ``definition`` is the text that a publisher sends
-    and a bag keeps, with all nested types. ``converted_from`` is `ROS2` for messages of ROS 2 that the source
-    has converted to this type, and empty for those that are as they were published.
+    messages. ``kind`` has the form of its ROS: ``package/Type``, or ``package/msg/Type`` in ROS 2.
+    ``definition`` is the text that a publisher sends and a bag keeps, with all nested types. ``md5sum`` is in
+    ROS 2 the type's hash. ``converted_from`` is `ROS2` in old recordings of ROS 2 bags, whose messages were
+    converted to ROS 1.
     """
 
     stream: str
@@ -211,7 +237,7 @@ class MessageType(NamedTuple):
 
     @property
     def layout(self) -> str:
-        """The layout for decoding messages; empty for an invalid definition."""
+        """The layout for decoding messages, as `RosType` has it."""
         return RosType(self.topic, self.kind, self.md5sum, self.definition).layout
 
     def sample(self) -> dict[str, Value]:

@@ -115,7 +115,7 @@ class Attachments:
         raw = message.raw
         beside: dict[str, Value] = {}
         for field, content in message.large.items():
-            raw, at = cut(raw, content, len(message.raw) - len(raw))
+            raw, at = cut(raw, content, len(message.raw) - len(raw), ros2=message.kind.ros2)
             beside.update(self._attachment(stream, t_us, field, content, keep=keep))
             beside[f"{field}.{ATTACHMENT_AT}"] = at
         return RosMessage(raw, message.kind, beside=beside)

@@ -1,9 +1,10 @@
-"""JSON as a ROS 1 message and back, by the message's own definition.
+"""JSON as a message of ROS 1 or ROS 2 and back, by the message's own definition.
 
 Two writers of JSON are known. People and programs write commands: those are `encode`d strictly, as nothing in
 a command may be guessed. A rosbridge server writes what a publisher sent: a `Writer` that is not ``strict``
 takes its base64 for ``uint8[]`` and its null for NaN. Both take ROS 1's and ROS 2's names for the parts of a
-time, and a header without a seq, as ROS 2 has none.
+time, and a header without a seq, as ROS 2 has none. A message of ROS 2 is written as little-endian CDR, and
+its bounds hold: the middleware would not publish what is beyond them.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ from iort_contract.ros.definition import (
     HEADER_TYPE,
     LETTERS,
     STRING,
+    TEXTS,
     TIME,
     VARIABLE,
     Definition,
     Field,
+    short_kind,
 )
+from iort_contract.ros.plan import CDR_LITTLE, CDR_START, SIZES, cdr_order, cdr_text, fits, padding
 
 _LENGTH = struct.Struct("<I")
 # A message of JSON within the broker's limit has no more elements; nested empty ones could have.
@@ -49,18 +53,19 @@ def encode(
     if definition.stamped() and isinstance(message, dict) and "header" not in message:
         sec, microseconds = divmod(now_us, 1_000_000)
         stamp = {"sec": sec, "nanosec": microseconds * 1000}
-        message = {**message, "header": {"seq": 0, "stamp": stamp, "frame_id": ""}}
+        message = {**message, "header": {"stamp": stamp, "frame_id": ""}}
     return Writer(definition, strict=True, partial=partial).write(message)
 
 
 def decode(definition: Definition, data: bytes) -> dict[str, Any]:
     """The message as JSON. Raises `MessageError` if the bytes do not fit the definition."""
+    reader = _Reader(definition, data)
     try:
-        message, at = _read(definition, Field("", definition.kind, None), data, 0)
+        message = reader.read(Field("", short_kind(definition.kind), None))
     except struct.error as error:
         raise MessageError(f"{definition.kind}: the message of {len(data)} bytes is truncated") from error
-    if at != len(data):
-        raise MessageError(f"{definition.kind}: the message must have {at} bytes, got {len(data)}")
+    if not fits(reader.at, len(data), ros2=definition.ros2):
+        raise MessageError(f"{definition.kind}: the message must have {reader.at} bytes, got {len(data)}")
     assert isinstance(message, dict)
     return message
 
@@ -86,21 +91,31 @@ class Writer:
         self._strict = strict
         self._partial = partial
         self._plans: dict[str, _Plan] = {}
-        self._parts: list[bytes] = []
+        self._ros2 = definition.ros2
+        self._parts = bytearray()
 
     def write(self, message: Any) -> bytes:
         """The message's bytes. Raises `MessageError`, which names the field, for a message of another
         type."""
-        self._parts = []
+        self._parts = bytearray(CDR_LITTLE + b"\0\0" if self._ros2 else b"")
         try:
-            self._message(self._definition.kind, message, "")
+            self._message(short_kind(self._definition.kind), message, "")
         except RecursionError as error:
             raise MessageError(f"{self._definition.kind}: the message is nested too deeply") from error
-        return b"".join(self._parts)
+        return bytes(self._parts)
+
+    def _align(self, size: int) -> None:
+        if self._ros2:
+            self._parts += bytes(padding(len(self._parts), size))
+
+    def _add_length(self, length: int) -> None:
+        self._align(4)
+        self._parts += _LENGTH.pack(length)
 
     def _message(self, kind: str, value: Any, path: str) -> None:
         if kind not in self._plans:
-            self._plans[kind] = _plan(self._definition, kind, strict=self._strict)
+            # A message of ROS 2 is written field by field.
+            self._plans[kind] = _plan(self._definition, kind, strict=self._strict or self._ros2)
         fields = self._definition.fields(kind)
         if type(value) is not dict:
             raise _wrong(path, value, f"an object of {', '.join(f.name for f in fields) or 'no fields'}")
@@ -109,12 +124,14 @@ class Writer:
         unknown = sorted(map(str, value.keys() - {field.name for field in fields}))
         if unknown:
             raise MessageError(f"{_join(path, unknown[0])}: {kind} has no such field")
+        if self._ros2 and not fields:
+            self._parts += b"\0"
         for part in self._plans[kind]:
             if isinstance(part, Field):
                 self._member(kind, part, value, path)
                 continue
             try:
-                self._parts.append(part.struct.pack(*part.get(value)))
+                self._parts += part.struct.pack(*part.get(value))
             except (KeyError, struct.error, OverflowError):
                 # Field by field: for a null, for an optional field, or for the error.
                 for field in part.fields:
@@ -133,15 +150,30 @@ class Writer:
         if field.length is not None:
             self._array(field, value, path)
         elif field.kind in LETTERS:
-            self._parts.append(self._number(field.kind, value, path))
-        elif field.kind == STRING:
-            text = _text(value, path)
-            self._parts.append(_LENGTH.pack(len(text)) + text)
+            self._align(SIZES[field.kind])
+            self._parts += self._number(field.kind, value, path)
+        elif field.kind in TEXTS:
+            self._text(field, value, path)
         else:
             self._message(field.kind, value, path)
 
+    def _text(self, field: Field, value: Any, path: str) -> None:
+        text = _encoded(value, path, "utf-8" if field.kind == STRING else "utf-16-le")
+        units = len(text) if field.kind == STRING else len(text) // 2
+        if field.longest is not None and units > field.longest:
+            raise MessageError(f"{path}: must have at most {field.longest} characters, got {units}")
+        if field.kind == STRING and self._ros2:
+            if b"\0" in text:
+                raise _wrong(path, value, "a text without NUL")
+            text += b"\0"
+            units += 1
+        elif field.kind != STRING:
+            text = struct.pack(f"<{units}I", *struct.unpack(f"<{units}H", text))
+        self._add_length(units)
+        self._parts += text
+
     def _array(self, field: Field, value: Any, path: str) -> None:
-        element = Field(field.name, field.kind, None)
+        element = field.element()
         if value is _ZEROS:
             value = [_zero(element)] * (field.length or 0)
         if type(value) is str and field.kind in _BYTES and not self._strict:
@@ -152,14 +184,19 @@ class Writer:
         elif type(value) is not list or (self._strict and len(value) > _MAX_ELEMENTS):
             raise _wrong(path, value, f"a list of up to {_MAX_ELEMENTS}")
         if field.length == VARIABLE:
-            self._parts.append(_LENGTH.pack(len(value)))
+            if field.most is not None and len(value) > field.most:
+                raise MessageError(f"{path}: must have at most {field.most} elements, got {len(value)}")
+            self._add_length(len(value))
         elif len(value) != field.length:
             raise MessageError(f"{path}: must have {field.length} elements, got {len(value)}")
         if field.kind in LETTERS and not self._strict:
             # If that fails: element by element, for a null or for the error.
             with suppress(struct.error, OverflowError):
                 letters = f"<{len(value)}{_LETTERS[field.kind]}"
-                self._parts.append(value if type(value) is bytes else struct.pack(letters, *value))
+                numbers = value if type(value) is bytes else struct.pack(letters, *value)
+                if numbers:
+                    self._align(SIZES[field.kind])
+                self._parts += numbers
                 return
         for i, item in enumerate(value):
             self._put(element, item, f"{path}.{i}")
@@ -244,11 +281,11 @@ def _time(value: Mapping[str, Any], path: str, *, strict: bool) -> dict[str, Any
     return found
 
 
-def _text(value: Any, path: str) -> bytes:
+def _encoded(value: Any, path: str, encoding: str) -> bytes:
     if not isinstance(value, str):
         raise _wrong(path, value, "a text")
     try:
-        return value.encode()
+        return value.encode(encoding)
     except UnicodeEncodeError as error:
         raise _wrong(path, value, "a text of Unicode") from error
 
@@ -262,28 +299,47 @@ def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _read(definition: Definition, field: Field, data: bytes, at: int) -> tuple[Any, int]:
-    if field.length is not None:
-        n = field.length
-        if n == VARIABLE:
-            (n,) = _LENGTH.unpack_from(data, at)
-            at += 4
-        if n > _MAX_ELEMENTS:
-            raise MessageError(f"{field.name}: must have at most {_MAX_ELEMENTS} elements, got {n}")
-        items = []
-        for _ in range(n):
-            item, at = _read(definition, Field(field.name, field.kind, None), data, at)
-            items.append(item)
-        return items, at
-    if field.kind in LETTERS:
-        reader = struct.Struct(f"<{LETTERS[field.kind]}")
-        return reader.unpack_from(data, at)[0], at + reader.size
-    if field.kind == STRING:
-        (n,) = _LENGTH.unpack_from(data, at)
-        if at + 4 + n > len(data):
-            raise struct.error
-        return data[at + 4 : at + 4 + n].decode("utf-8", "replace"), at + 4 + n
-    message = {}
-    for nested in definition.fields(field.kind):
-        message[nested.name], at = _read(definition, nested, data, at)
-    return message, at
+class _Reader:
+    """Reads a message's bytes from ``at`` on."""
+
+    def __init__(self, definition: Definition, data: bytes) -> None:
+        self.at = 0
+        self._definition = definition
+        self._data = data
+        self._ros2 = definition.ros2
+        self._order = "<"
+        if self._ros2:
+            self.at = CDR_START
+            self._order = cdr_order(definition.kind, data)
+
+    def read(self, field: Field) -> Any:
+        """The field's value; raises `struct.error` for bytes that end too early."""
+        if field.length is not None:
+            n = self._number("uint32") if field.length == VARIABLE else field.length
+            if n > _MAX_ELEMENTS:
+                raise MessageError(f"{field.name}: must have at most {_MAX_ELEMENTS} elements, got {n}")
+            return [self.read(field.element()) for _ in range(n)]
+        if field.kind in LETTERS:
+            return self._number(field.kind)
+        if field.kind in TEXTS:
+            n = self._number("uint32") * (1 if field.kind == STRING else 4)
+            if self.at + n > len(self._data):
+                raise struct.error
+            content = self._data[self.at : self.at + n]
+            self.at += n
+            return (
+                cdr_text(field.kind, content, self._order)
+                if self._ros2
+                else content.decode("utf-8", "replace")
+            )
+        fields = self._definition.fields(field.kind)
+        if self._ros2 and not fields:
+            self.at += 1
+        return {nested.name: self.read(nested) for nested in fields}
+
+    def _number(self, kind: str) -> Any:
+        if self._ros2:
+            self.at += padding(self.at, SIZES[kind])
+        (number,) = struct.unpack_from(f"{self._order}{LETTERS[kind]}", self._data, self.at)
+        self.at += SIZES[kind]
+        return number

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from iort_analysis.archive.hours import key_of
 from iort_analysis.archive.stored import Origin, PageProgress
 from iort_analysis.samples.batches import Item, RefusedItems
+from iort_contract.codec import ROS2_CODEC
 from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
@@ -75,7 +76,7 @@ class Export:
         if ros_messages is None:
             self.others += len(inside)
             return ()
-        if ros_messages.type_id not in self.types and not ros_messages.layout:
+        if ros_messages.type_id not in self.types and not ros_messages.readable:
             self.refused.add(ContractError(f"the type {ros_messages.type_id} is not declared"), batch.id)
             return ()
         if ros_messages.type_id not in self.types:
@@ -83,13 +84,16 @@ class Export:
             stream = self._selection.stream
             self.types[ros_messages.type_id] = MessageType(stream, f"/{stream}", kind, "", definition)
         name, raws = ros_messages.type_id, ros_messages.raw
+        ros2 = ros_messages.codec == ROS2_CODEC
         try:
-            return [Published(batch.times_us[i], name, self._filled(raws[i], batch, i)) for i in inside]
+            return [
+                Published(batch.times_us[i], name, self._filled(raws[i], batch, i, ros2=ros2)) for i in inside
+            ]
         except ContractError as error:
             self.refused.add(error, batch.id)
             return ()
 
-    def _filled(self, raw: bytes, batch: Batch, i: int) -> bytes:
+    def _filled(self, raw: bytes, batch: Batch, i: int, *, ros2: bool) -> bytes:
         """The message with its files' contents: the content that was cut out last comes back first."""
         places = [name for name in batch.columns if name.endswith(f".{ATTACHMENT_AT}")]
         for place in reversed(places):
@@ -105,7 +109,7 @@ class Export:
                 # The places of the contents before it are no longer known.
                 self.empty += 1
                 break
-            raw = filled(raw, content, at)
+            raw = filled(raw, content, at, ros2=ros2)
         return raw
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from iort_contract.codec import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
+from iort_contract.codec import CODEC, DICTIONARY, ROS1_CODEC, inflate
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_contract.ros.message import Messages, RosType
 from testkit.ros1_types import Message
@@ -124,7 +124,7 @@ def test_the_pages_reader_reads_messages_as_they_were_published(
 ) -> None:
     raw = [struct.pack("<I", len(text)) + text for text in texts]
     batch = batch_of({"data.key": ["a", None, "b"]}, Messages(kind.id, kind.layout, raw))
-    assert batch["codec"] == SERIALIZED_CODEC
+    assert batch["codec"] == ROS1_CODEC
     times_us, columns, behind = page["opened"](batch)
     assert (times_us, columns) == (TIMES_US, {"data.key": ["a", None, "b"]})
     assert page["as_published"](batch["n"], behind) == raw

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract.codec import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
+from iort_contract.codec import CODEC, DICTIONARY, ROS1_CODEC, inflate
 from iort_contract.limits import (
     MAX_BATCH_VALUES,
     MAX_COLUMNS_BYTES,
@@ -126,7 +126,7 @@ QUIET, SIGNALLING = 0x7FF8000000000001, 0x7FF0000000000001
 def test_messages_that_a_column_would_change_are_kept_as_bytes(odd: bytes) -> None:
     raws = [flat(), odd, flat(n=4)]
     batch = batch_of(FLAT, raws)
-    assert codec_of(batch) == SERIALIZED_CODEC
+    assert codec_of(batch) == ROS1_CODEC
     # The batch itself contains the layout.
     assert again(batch, {}) == raws
     decoded = decode_batch(encode_batch(batch))
@@ -179,7 +179,7 @@ def test_any_valid_header_is_restored(raws: list[bytes]) -> None:
 )
 def test_an_invalid_header_is_restored(odd: bytes) -> None:
     batch = batch_of(STAMPED_FLAT, [stamped(0), odd])
-    assert codec_of(batch) == SERIALIZED_CODEC
+    assert codec_of(batch) == ROS1_CODEC
     assert again(batch, {}) == [stamped(0), odd]
 
 
@@ -192,7 +192,7 @@ def test_columns_are_smaller_than_the_messages_bytes() -> None:
     assert len(encode_batch(smooth)) * 3 // 4 < packed
     noise = random.Random(1)
     noisy = batch_of(FLAT, [flat(x=noise.random()) for _ in range(50)])
-    assert codec_of(noisy) == SERIALIZED_CODEC
+    assert codec_of(noisy) == ROS1_CODEC
 
 
 def test_the_layout_must_be_known_and_fit_the_columns() -> None:
@@ -345,7 +345,7 @@ def test_messages_with_too_long_a_definition_are_stored_without_columns() -> Non
 )  # fmt: skip
 def test_other_messages_are_kept_byte_for_byte(kind: RosType, raws: list[bytes]) -> None:
     batch = batch_of(kind, raws)
-    assert codec_of(batch) == SERIALIZED_CODEC
+    assert codec_of(batch) == ROS1_CODEC
     assert again(batch, {}) == raws
 
 
@@ -372,7 +372,7 @@ def test_columns_beside_messages_are_part_of_their_samples() -> None:
     assert list(messages.raw) == raws
     # Numeric messages, too.
     numbers = batch_of(FLAT, [flat()], {"note": ["n"]})
-    assert codec_of(numbers) == SERIALIZED_CODEC
+    assert codec_of(numbers) == ROS1_CODEC
     assert again(numbers, {}) == [flat()]
 
 
@@ -461,7 +461,7 @@ def test_a_damaged_batch_of_messages_is_read_or_refused(kind: RosType, data: Any
     for damaged in (bytes(body), bytes(body[:at])):
         deflater = zlib.compressobj(zdict=DICTIONARY)
         packed = base64.b64encode(deflater.compress(damaged) + deflater.flush()).decode()
-        for codec in (CODEC, SERIALIZED_CODEC):
+        for codec in (CODEC, ROS1_CODEC):
             try:
                 _, messages = messages_of({**envelope, "codec": codec, "samples": packed}, LAYOUTS)
             except ContractError:
