@@ -76,6 +76,7 @@ def load_config(file: Path) -> Config:
         config = replace(config, queue=replace(config.queue, path=default_path(file, config.robot)))
     try:
         config.downlink.check_topics()
+        config.downlink.graph(config.sources)
     except ContractError as error:
         raise place.child("downlink").problem(str(error)) from error
     try:

@@ -4,7 +4,7 @@ downlink:
   cmd:                                    # cmd/<namespace>/<robot>/<name>
     drive:
       topic: /drive
-      type: ackermann_msgs/AckermannDriveStamped
+      type: ackermann_msgs/AckermannDriveStamped    # ROS 2: ackermann_msgs/msg/AckermannDriveStamped
       motion: {lease_s: 0.5, stop: {drive: {speed: 0.0}}}
   drive: {command: drive}                 # what a stick on the page or `iort drive` drives, and its limits
   ask:                                    # the service /iort/ask/calibration, and topics of that name
@@ -17,10 +17,11 @@ share:                                    # to fleet/<namespace>/<robot>/<name>
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any, Iterable, Mapping, NamedTuple
 
 from iort_agent.common.schema import (
     FILE,
@@ -35,7 +36,7 @@ from iort_agent.common.schema import (
     text,
 )
 from iort_agent.errors import AskError
-from iort_agent.sources.ros1 import ros_name
+from iort_agent.sources.ros1 import Ros1Config, ros_name
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
 from iort_contract.messages.commands import (
@@ -57,8 +58,11 @@ _FLEET = "a mapping of name to ROS topic and type"
 
 
 def _ros_type(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z]\w*/[A-Za-z]\w*", value, re.ASCII):
-        raise ContractError(f"ROS type must be package/Type, such as std_msgs/Float64, got {value!r}")
+    if not re.fullmatch(r"[A-Za-z]\w*/(msg/)?[A-Za-z]\w*", value, re.ASCII):
+        raise ContractError(
+            "ROS type must be package/Type, such as std_msgs/Float64, or package/msg/Type for ROS 2, "
+            f"got {value!r}"
+        )
     return value
 
 
@@ -79,6 +83,17 @@ def _object(value: Any, place: Place) -> Any:
     if not isinstance(value, dict):
         raise place.error(value, "a mapping of the ROS message's fields")
     return value
+
+
+def _ros_of(kind: str) -> int:
+    return 2 if kind.count("/") == 2 else 1
+
+
+class RosGraph(NamedTuple):
+    """Of which ROS the graph is, 1 or 2, and the name of the agent's node in it, if a source says it."""
+
+    version: int
+    node: str | None
 
 
 @dataclass(frozen=True)
@@ -190,6 +205,24 @@ class DownlinkConfig:
             for _, command in self.cmd
             if command.motion is not None
         }
+
+    def graph(self, sources: Iterable[object]) -> RosGraph:
+        """The graph that everything here and in `share` is for: the one of the sources. The types decide if
+        these are of both kinds, or of none. Raises `ContractError` for a type of the other ROS."""
+        nodes = {1: one.node for one in sources if isinstance(one, Ros1Config)}  # noqa: B035 - one ROS so far
+        types = {
+            f"{section}.{name}.type": settings.type
+            for section, entries in (("cmd", self.cmd), ("fleet", self.fleet))
+            for name, settings in entries
+        }
+        versions = set(nodes) if len(nodes) == 1 else {_ros_of(kind) for kind in types.values()} or set(nodes)
+        # Without any of them, the ROS that was sourced.
+        version = max(versions or {2 if os.environ.get("ROS_VERSION") == "2" else 1})
+        for key, kind in types.items():
+            if _ros_of(kind) != version:
+                form = kind.replace("/", "/msg/") if version == 2 else kind.replace("/msg/", "/")
+                raise ContractError(f"{key} must be {form}, as the graph is of ROS {version}, got {kind}")
+        return RosGraph(version, nodes.get(version))
 
     def check_topics(self) -> None:
         """Raise `ContractError` for a command without motion on a topic that moves the robot, since neither a

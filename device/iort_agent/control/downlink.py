@@ -12,15 +12,14 @@ from iort_agent.common.threads import Supervised
 from iort_agent.control import Bridge
 from iort_agent.control.commands import Commands, Operator
 from iort_agent.control.config import DownlinkConfig, ShareConfig
-from iort_agent.control.guard import Guard
+from iort_agent.control.guard import NODES, Guard
 from iort_agent.control.peers import Peers, Shares
 from iort_agent.control.questions import Asks, Questions
 from iort_agent.errors import SourceError
 from iort_agent.files.upload import Uploader, downloader
 from iort_agent.mqtt.uplink import Link
 from iort_agent.ros import Graph
-from iort_agent.ros.ros1_node import DEFAULT_NODE, Node, shared
-from iort_agent.sources.ros1 import Ros1Config
+from iort_agent.ros.ros1_node import DEFAULT_NODE
 
 _log = logging.getLogger(__name__)
 
@@ -141,21 +140,20 @@ def make_downlink(
     """The downlink of a configuration that has one: in the ROS node of the sources, or in a ``graph`` that is
     no ROS graph if they need no node.
 
-    Raises as `Downlink`, and `SourceError` without rospy.
+    Raises as `Downlink`, and `SourceError` without rospy or rclpy.
     """
     if not (config.cmd or config.fleet or config.ask or share):
         return None
-    node = next((source.node for source in sources if isinstance(source, Ros1Config)), None)
-    if graph is None or node is not None:
+    guard, ros = None, config.graph(sources)
+    if graph is None or ros.node is not None:
         try:
-            graph = shared(node or DEFAULT_NODE, link.clock)
+            graph = node = NODES[ros.version](ros.node or DEFAULT_NODE, link.clock)
         except SourceError as error:
             raise SourceError(
-                f"downlink and share need ROS 1; without it remove them from car.yaml: {error}"
+                f"downlink and share need ROS {ros.version}; without it remove them from car.yaml: {error}"
             ) from error
-    guard = None
-    if isinstance(graph, Node) and config.moves():
-        guard = Guard(graph.base, config.motions(), link.clock, queue)
+        if config.moves():
+            guard = Guard(node.base, config.motions(), link.clock, queue, ros=node.ros)
     questions = None
     if config.ask and uploader is not None:
         questions = Questions(link, uploader, download=downloader(root_ca), offset=offset)

@@ -1,9 +1,9 @@
 """What stops the robot when the agent dies or freezes: a small process, and a file for the next run.
 
-The guard is a ROS node of its own, which the agent starts (`python -m iort_agent.control.guard`). The agent
-tells it the end of each lease before the command passes, and each emergency stop. If a lease ends that the
-agent has neither renewed nor ended, or if the agent is gone, the guard publishes the stop; that of an
-emergency stop until the agent is back.
+The guard is a node of its own in the agent's ROS graph, in a process that the agent starts
+(`python -m iort_agent.control.guard`). The agent tells it the end of each lease before the command passes,
+and each emergency stop. If a lease ends that the agent has neither renewed nor ended, or if the agent is
+gone, the guard publishes the stop; that of an emergency stop until the agent is back.
 
 Its input is lines of JSON: first the name of the agent's node and the stops; then a motion's topic, the end
 of its lease by the machine's monotonic clock, or null, and whether an emergency stop holds. It answers each
@@ -23,14 +23,18 @@ import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any, Callable, Mapping, Union
 
 from iort_agent.common.threads import Clock, Supervised, SystemClock
 from iort_agent.control.leases import Stops
+from iort_agent.ros import ros1_node, ros2_node
 from iort_agent.ros.json_message import encode
-from iort_agent.ros.ros1_node import Node, shared
 
 _log = logging.getLogger("iort_agent.guard")
+
+Node = Union[ros1_node.Node, ros2_node.Node]
+# Gives the process' node in the graph of a ROS, 1 or 2.
+NODES: dict[int, Callable[..., Node]] = {1: ros1_node.shared, 2: ros2_node.shared}
 
 PROCESS = "iort_agent.control.guard"
 # The guard answers each line with one byte. If it does not within this time, it is frozen.
@@ -93,15 +97,21 @@ class StopFile:
 
 
 class Guard:
-    """``agent`` is the name of the agent's node; ``stops`` has the type and the message of each motion's
-    stop, by its topic; ``queue`` is the file beside which an emergency stop is kept. Not for several threads
-    at once."""
+    """``agent`` is the name of the agent's node in the graph of ``ros``, 1 or 2; ``stops`` has the type and
+    the message of each motion's stop, by its topic; ``queue`` is the file beside which an emergency stop is
+    kept. Not for several threads at once."""
 
     def __init__(
-        self, agent: str, stops: Mapping[str, Mapping[str, Any]], clock: Clock, queue: Path | None = None
+        self,
+        agent: str,
+        stops: Mapping[str, Mapping[str, Any]],
+        clock: Clock,
+        queue: Path | None = None,
+        *,
+        ros: int = 1,
     ) -> None:
         file = str(queue.absolute()) if queue is not None else None
-        self._first = _line({"agent": agent, "stops": stops, "queue": file})
+        self._first = _line({"agent": agent, "ros": ros, "stops": stops, "queue": file})
         self._clock = clock
         self._process: subprocess.Popen[bytes] | None = None
         # What it must know after a restart, by topic.
@@ -244,12 +254,14 @@ class _Motion:
 class _Guard:
     def __init__(self, config: Mapping[str, Any]) -> None:
         self._agent: str = config["agent"]
-        self.node, self._clock = shared(f"{self._agent}_guard"), SystemClock()
+        self.node, self._clock = NODES[config["ros"]](f"{self._agent}_guard"), SystemClock()
         self._motions = {topic: _Motion(self.node, topic, stop) for topic, stop in config["stops"].items()}
         # Stops since the last news of a lease. At its end the agent publishes a stop itself, and tells it.
         self._stops = 0
         self._joined: float | None = None
         self._queue: str | None = config.get("queue")
+        # The agent that has died: in ROS 2 it seems to live for a while.
+        self._gone: frozenset[str] | None = None
 
     def ready(self) -> bool:
         """Whether the stops would be heard: the topics' subscribers have connected, or had the time to."""
@@ -291,8 +303,12 @@ class _Guard:
             # The agent may have died before it did. A slow disk delays no stop here.
             StopFile(Path(self._queue)).write(stopped=True)
         seen = 0
+        if self._gone is None:
+            self._gone = self.node.living(self._agent)
         while not over.wait(_LOOK_S):
-            seen = seen + 1 if self.node.lives(self._agent) else 0
+            living = self.node.living(self._agent)
+            self._gone &= living
+            seen = seen + 1 if living - self._gone else 0
             if seen == _LOOKS:
                 over.set()
 

@@ -45,7 +45,7 @@ from iort_contract.topics import ANSWER, ASK
 NO_ANSWER, NOT_CONNECTED = "no_answer", "not_connected"
 # How long a question waits before it asks again for room in the rate limiter.
 _NO_ROOM_S = 0.05
-STRING = "std_msgs/String"
+_STRINGS = {1: "std_msgs/String", 2: "std_msgs/msg/String"}
 # Questions by the topic that wait for their turn.
 _MOST_WAITING = 8
 # The name of a question, its configuration, and the text that was published; None ends the thread.
@@ -160,14 +160,14 @@ class Asks:
 
     def __init__(self, asks: Sequence[tuple[str, AskConfig]], bridge: Bridge, questions: Questions) -> None:
         self._bridge, self._questions = bridge, questions
-        self._string = bridge.graph.definition(STRING)
+        self._string = bridge.graph.definition(_STRINGS[bridge.graph.ros])
         self._queue: queue.Queue[_Asked | None] = queue.Queue(_MOST_WAITING)
         self._thread = Supervised("asks", self._run)
         self._lock = threading.Lock()
         self._counts: dict[str, Counter[str]] = {name: Counter() for name, _ in asks}
         for name, config in asks:
             bridge.graph.offer(asked_on(name), functools.partial(self._called, name, config))
-            bridge.graph.advertise(answered_on(name), STRING)
+            bridge.graph.advertise(answered_on(name), self._string.kind)
             bridge.graph.subscribe(asked_on(name), functools.partial(self._on_ros, name, config))
 
     def start(self) -> None:
@@ -208,9 +208,9 @@ class Asks:
                 self._counts[name][outcome] += 1
 
     def _on_ros(self, name: str, config: AskConfig, header: Mapping[str, str], data: bytes) -> None:
-        kind = header.get("type")
-        if kind != STRING:
-            self._bridge.reject(asked_on(name), "malformed", f"type must be {STRING}, got {kind}")
+        kind, string = header.get("type"), self._string.kind
+        if kind != string:
+            self._bridge.reject(asked_on(name), "malformed", f"type must be {string}, got {kind}")
             return
         try:
             self._queue.put_nowait((name, config, decode(self._string, data)["data"]))

@@ -14,7 +14,12 @@ OnBytes = Callable[[Mapping[str, str], bytes], None]
 
 class Graph(Protocol):
     """A ROS graph as its users see it: topics to publish and to hear, in the messages' own bytes. No call
-    blocks. `iort_agent.ros.ros1_node.Node` is the real one."""
+    blocks. `iort_agent.ros.ros1_node.Node` and `iort_agent.ros.ros2_node.Node` are the real ones.
+
+    ``ros`` is 1 or 2: the form of its types' names, and of its messages' bytes.
+    """
+
+    ros: int
 
     def definition(self, kind: str) -> Definition:
         """The definition of an installed type. Raises `SourceError` if it is not installed."""
@@ -32,7 +37,7 @@ class Graph(Protocol):
         """Receive a topic's messages, of any type, in another thread."""
 
     def offer(self, service: str, handler: OnTrigger) -> None:
-        """Answer calls of a service of the type std_srvs/Trigger, each in a thread of its own."""
+        """Answer calls of a service of the ROS' type Trigger, of std_srvs, each in a thread of its own."""
 
     def waits(self) -> str | None:
         """Why the graph cannot be joined, for a person."""

@@ -69,6 +69,8 @@ def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:
 class Node:
     """Use `shared`. Subscriptions and publishers may be requested before there is a master."""
 
+    ros = 1
+
     def __init__(self, name: str, rospy: Any, clock: Clock) -> None:
         self.name = name
         self.users = 0
@@ -205,14 +207,14 @@ class Node:
         """How many subscribers an advertised topic is connected to."""
         return _connections(self._publishers.get(self.resolve(topic)))
 
-    def lives(self, base: str) -> bool:
-        """Whether a node of this name, in our namespace, is in the graph and answers."""
+    def living(self, base: str) -> frozenset[str]:
+        """The address of the node of this name, in our namespace, if it is in the graph and answers."""
         name = self._me[: -len(self.base)] + base
         try:
             uri = ros1_master.Master(self._uri, self._me).ask("lookupNode", name)
         except ros1_master.ERRORS:
-            return False
-        return self._answers(uri, name)
+            return frozenset()
+        return frozenset([uri] if self._answers(uri, name) else [])
 
     # All below runs in the node's own thread.
 

@@ -40,6 +40,8 @@ def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:
 class Node:
     """Use `shared`. Subscriptions and publishers may be requested before anybody else is in the graph."""
 
+    ros = 2
+
     def __init__(self, name: str, join: Callable[[str], Any], clock: Clock) -> None:
         self.name = self.base = name
         self._join = join
@@ -128,9 +130,10 @@ class Node:
         """How many subscribers an advertised topic is connected to."""
         return len(self._wanted.get(self.resolve(topic), "")) * 0
 
-    def lives(self, base: str) -> bool:
-        """Whether a node of this name, in our namespace, is in the graph."""
-        return base == self.base and self.ready.is_set()
+    def living(self, base: str) -> frozenset[str]:  # noqa: ARG002 - as ROS 1's node
+        """What tells the nodes of this name, in our namespace, apart: an identifier of each in the graph. One
+        that was killed stays there until the middleware misses it, beside the one that was started since."""
+        return frozenset()
 
     # All below runs in the node's own thread.
 

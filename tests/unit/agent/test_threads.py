@@ -156,8 +156,8 @@ def asks(kind: str, _folder: Path, _patch: pytest.MonkeyPatch) -> None:
 
 def guard(_kind: str, folder: Path, patch: pytest.MonkeyPatch) -> None:
     """It still notices that the agent is back, and ends."""
-    node, looks = test_guard.Node(), iter([surprise, *[lambda: True] * 3])
-    patch.setattr(node, "lives", lambda _name: next(looks)())
+    node, looks = test_guard.Node(), iter([surprise, frozenset, *[lambda: frozenset(["back"])] * 3])
+    patch.setattr(node, "living", lambda _name: next(looks)())
     patch.setattr(test_guard.guard_module, "_LOOK_S", 0.01)
     test_guard.guarded(node, patch, ["/speed", None, True], queue=folder / "queue.db")
     assert next(looks, None) is None

@@ -123,6 +123,8 @@ class SimGraph(Graph):
     """Keeps the newest drive command, of any topic, until that topic is released. Safe to use from several
     threads."""
 
+    ros = 1
+
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._lock = threading.Lock()

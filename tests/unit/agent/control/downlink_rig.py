@@ -61,6 +61,8 @@ def doubles(*values: float) -> bytes:
 class FakeGraph:
     """ROS topics in memory; what is published on one is heard on it."""
 
+    ros = 1
+
     def __init__(self) -> None:
         self.published: list[tuple[str, bytes]] = []
         self.kinds: dict[str, str] = {}

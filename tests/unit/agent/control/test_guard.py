@@ -80,8 +80,8 @@ class Node:
         self.published.append(data)
         return True
 
-    def lives(self, _base: str) -> bool:
-        return False
+    def living(self, _base: str) -> frozenset[str]:
+        return frozenset()
 
     def advertise(self, *_: Any) -> None:
         pass
@@ -95,11 +95,11 @@ def guarded(node: Node, monkeypatch: pytest.MonkeyPatch, *told: Any, queue: Path
     nobody, answers = os.pipe()
     os.close(nobody)
     stops = {"/speed": {"type": "std_msgs/Float64", "stop": {"data": 0.0}}}
-    first = {"agent": "car", "stops": stops, "queue": str(queue) if queue is not None else None}
+    first = {"agent": "car", "ros": 1, "stops": stops, "queue": str(queue) if queue is not None else None}
     for line in (first, *told):
         os.write(written, json.dumps(line).encode() + b"\n")
     os.close(written)
-    monkeypatch.setattr(guard_module, "shared", lambda _name: node)
+    monkeypatch.setitem(guard_module.NODES, 1, lambda _name: node)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     with os.fdopen(lines) as stdin, os.fdopen(answers, "w") as stdout:
         monkeypatch.setattr(sys, "stdin", stdin)
@@ -119,8 +119,10 @@ def test_the_lease_of_an_agent_that_was_killed_before_it_heard_the_answer_ends_w
 def test_an_agent_that_is_back_for_a_moment_does_not_end_an_emergency_stop(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    node, looks = Node(), iter([True, True, False, True, True, True])
-    monkeypatch.setattr(node, "lives", lambda _name: next(looks))
+    # The one that died seems to live for a while, as in ROS 2.
+    old, new = frozenset(["old"]), frozenset(["new"])
+    node, looks = Node(), iter([old, old, old, old, old | new, old | new, old, new, new, new])
+    monkeypatch.setattr(node, "living", lambda _name: next(looks))
     monkeypatch.setattr(guard_module, "_LOOK_S", 0.01)
     queue = tmp_path / "queue.db"
     guarded(node, monkeypatch, ["/speed", None, True], queue=queue)
@@ -130,7 +132,10 @@ def test_an_agent_that_is_back_for_a_moment_does_not_end_an_emergency_stop(
 
 def test_an_emergency_stop_goes_on_until_the_agent_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
     node = Node()
-    monkeypatch.setattr(node, "lives", lambda name: name == "car" and len(node.published) > 12)
+    back = frozenset(["back"])
+    monkeypatch.setattr(
+        node, "living", lambda name: back if name == "car" and len(node.published) > 12 else frozenset()
+    )
     monkeypatch.setattr(guard_module, "_LOOK_S", 0.01)
     guarded(node, monkeypatch, ["/speed", None, True])
     assert len(node.published) > 12, "more than at the end of a lease"
