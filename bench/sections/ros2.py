@@ -15,7 +15,6 @@ Without ROS 2 or mosquitto the section has no figures and says why.
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 import subprocess
 import tempfile
@@ -121,12 +120,9 @@ def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int) ->
             ),
             FLOOR: graph.start("bench.floors.ros2_floor", load.kind, *load.topics),
         }
-        if ros2.has("rosbag2_transport") and (
-            command := shutil.which("ros2", path=graph.environment["PATH"])
-        ):
-            # The command is a script, whose own first line may name another Python.
+        if ros2.has("rosbag2_transport"):
             processes[RECORDER] = graph.run(
-                [ros2.python, command, "bag", "record", "-s", "mcap", "-o", str(bag), *load.topics]
+                ["ros2", "bag", "record", "-s", "mcap", "-o", str(bag), *load.topics]
             )
         publisher = graph.publisher(name, each, len(processes))
         publisher.ready()

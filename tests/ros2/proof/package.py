@@ -36,7 +36,7 @@ int32 l
 Part stamp
 wstring wide "breit"
 wstring<=4[<=3] wides
-string<=10 short
+string<=10 brief
 string[<=2] few
 bool[3] flags
 Part[2] pair

@@ -98,8 +98,8 @@ COMMANDS = {
     command.name: command
     for command in (
         Command("/cmd_vel", "geometry_msgs/msg/Twist", 10, "{linear: {x: 1.5}, angular: {z: -0.25}}"),
-        Command("/greeting", "std_msgs/msg/String", 5, "{data: 'Grüße, 世界 🏎'}"),
-        Command("/mode", "std_msgs/msg/UInt8", 1, "{data: 7}", _KEPT),
+        Command("/greeting", "std_msgs/msg/String", 5, "{data: 'Grüße, 世界 🏎!!!'}"),
+        Command("/mode", "std_msgs/msg/UInt32", 1, "{data: 7}", _KEPT),
     )
 }
 

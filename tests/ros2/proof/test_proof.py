@@ -12,6 +12,7 @@ import base64
 import json
 import os
 import re
+import signal
 import threading
 import time
 from dataclasses import dataclass
@@ -190,12 +191,12 @@ def _driven(robot: Robot) -> Drive:
     for publisher in publishers.values():
         publisher.until(lambda publisher=publisher: publisher.lines[-1].startswith("sent "), "end")
     for command in commands.values():
-        command.interrupt()
+        _interrupt(command)
     until(robot.settled, within_s=300)
     for publisher in publishers.values():
         publisher.say("quit")
     assert agent.terminate() in {0, 1}, "\n".join(agent.errors[-25:])
-    recorder.interrupt()
+    _interrupt(recorder)
     stored, failed = _export(robot)
     audited = invoke(robot.cloud.folder, "audit", robot.bundle.robot, "--json")
     assert audited.exit_code in {0, 1}, audited.output
@@ -209,6 +210,12 @@ def _driven(robot: Robot) -> Drive:
     ]
     others = [name for name in stored.kinds if stored.kinds[name][0] != recorded.kinds[name][0]]
     return Drive(rows, robot.absent, others, failed, audited.exit_code, audit, recorder.errors)
+
+
+def _interrupt(process: Any) -> None:
+    """End one of ROS' commands as Ctrl-C does; their statuses differ."""
+    process.signal(signal.SIGINT)
+    process.ended()
 
 
 def _published(
