@@ -51,6 +51,10 @@ executor = SingleThreadedExecutor()
 executor.add_node(node)
 threading.Thread(target=executor.spin, daemon=True).start()
 sys.stdin.readline()
+# What came last may still wait for the executor.
+before = -1
+while before != (before := count + len(delays_ms)):
+    time.sleep(0.5)
 if options.delays:
     options.delays.write_text(json.dumps(delays_ms))
-print(count or len(delays_ms), flush=True)
+print(before, flush=True)

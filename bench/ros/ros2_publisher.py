@@ -56,9 +56,10 @@ def main() -> None:
         pause.wait(0.05)
     print("ready", flush=True)
     sys.stdin.readline()
-    began, every_s = time.monotonic(), 1 / (load.rate_hz * len(publishers))
+    began, at_once = time.monotonic(), len(publishers) if load.together else 1
+    every_s = at_once / (load.rate_hz * len(publishers))
     for n in range(messages * len(publishers)):
-        ahead_s = began + n * every_s - time.monotonic()
+        ahead_s = began + n // at_once * every_s - time.monotonic()
         if ahead_s > 0:
             time.sleep(ahead_s)
         body = prepared[n % _BODIES]

@@ -5,7 +5,8 @@ All three subscribe to the same topics in the same run. The agent records to its
 mosquitto, where a watcher counts everything; the bare subscriber takes raw messages on rclpy's
 SingleThreadedExecutor, and counts them.
 
-- the processor time a message, at 1000 Hz, at 50 topics of 20 Hz, and at 30 Hz of 100 KB;
+- the processor time a message, at 1000 Hz, at 50 topics of 20 Hz, which come together or evenly, and at
+  30 Hz of 100 KB;
 - the messages lost, by the publisher's own count;
 - the time from ROS publish to an MQTT subscriber over the live lane, beside the bare subscriber's arrival.
 
@@ -28,7 +29,7 @@ from typing import Any
 from bench.floors import mosquitto
 from bench.floors.mosquitto import ROBOT, Mosquitto, subscribed
 from bench.report import NOT_MEASURED, Report, Section
-from bench.ros.ros2_loads import BIG, FAST, LIVE, LOADS, MANY, Load
+from bench.ros.ros2_loads import BIG, FAST, LIVE, LOADS, MANY, SPREAD, Load
 from bench.sections import Declared, Option
 from iort_agent.errors import AgentError
 from iort_agent.status import SOCKET, fetch
@@ -81,7 +82,7 @@ def run(_target: Target | None, say: Say, *, messages: int, duration: int) -> Se
         return section
     runs, live = list[Run](), dict[str, tuple[Spread, Spread]]()
     for middleware in [one for one in _MIDDLEWARES if one in ros2.middlewares()]:
-        for name in (FAST, MANY, BIG):
+        for name in (FAST, MANY, SPREAD, BIG):
             load = LOADS[name]
             each = messages // len(load.topics) if name == FAST else load.rate_hz * duration
             say(f"{middleware}, {load.title}: {each * len(load.topics):,} messages")
