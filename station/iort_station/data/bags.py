@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Writer as FolderWriter
 from rosbags.rosbag2.metadata import dump_qos_v8
 
 from iort_contract.ros.message import MessageType
-from iort_station.data.ros_forms import Form, form_of, is_ros2
+from iort_station.data.ros_forms import Form, form_of, from_ros2
 from iort_station.errors import StationError
 from iort_station.output import check_free, whole
 
@@ -48,7 +48,7 @@ class _File(ABC):
         self._begun: dict[tuple[str, str, str], Write] = {}
 
     def topic(self, kind: MessageType) -> Topic:
-        form = form_of(kind, ros2=is_ros2(kind) if self._ros2 is None else self._ros2)
+        form = form_of(kind, ros2=from_ros2(kind) if self._ros2 is None else self._ros2)
         named = (kind.topic, form.kind, form.md5sum)
         if named not in self._begun:
             try:

@@ -22,7 +22,7 @@ from iort_station.cloud import Cloud
 from iort_station.data import inventory, ros_messages
 from iort_station.data.bags import Recording, Topic
 from iort_station.data.recorded import Recorded, Selection
-from iort_station.data.ros_forms import ConversionError, is_ros2
+from iort_station.data.ros_forms import ConversionError, from_ros2
 from iort_station.fleet import files
 
 # Gives the content of an uploaded file by its key; None if the file is missing.
@@ -179,7 +179,7 @@ def _make(
     shared = len({kind.topic for kind in known}) > 1
     kind = ros_messages.in_ros1(known[-1]) if known and not shared else None
     # Beside messages of ROS 2, those without a type are ROS 2's, too.
-    origin = ROS2 if any(map(is_ros2, declared)) else ""
+    origin = ROS2 if any(map(from_ros2, declared)) else ""
     makers: dict[tuple[tuple[str, str], ...], tuple[ros_messages.Maker, Topic]] = {}
     numbers, written = itertools.count(), 0
     for block in blocks:

@@ -12,8 +12,8 @@ from rosbags.convert.converter import STATIC_MSGTYPE_RENAMES, is_same_wireformat
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from iort_contract.limits import MessageError
+from iort_contract.ros.definition import is_ros2, parse
 from iort_contract.ros.definition import md5sum as md5sum_of
-from iort_contract.ros.definition import parse
 from iort_contract.ros.message import ROS2, MessageType
 from iort_station.errors import StationError
 
@@ -43,9 +43,9 @@ class Form(NamedTuple):
     convert: Callable[[bytes], bytes] = bytes
 
 
-def is_ros2(kind: MessageType) -> bool:
+def from_ros2(kind: MessageType) -> bool:
     """Whether the messages are ROS 2's, or were before they were recorded."""
-    return "/msg/" in kind.kind or kind.converted_from == ROS2
+    return is_ros2(kind.kind) or kind.converted_from == ROS2
 
 
 def form_of(kind: MessageType, *, ros2: bool, own: bool = False) -> Form:
@@ -55,8 +55,7 @@ def form_of(kind: MessageType, *, ros2: bool, own: bool = False) -> Form:
     it keeps its fields. Raises `StationError` for a definition that is invalid or that the other ROS cannot
     have.
     """
-    was_ros2 = "/msg/" in kind.kind
-    if was_ros2 != ros2:
+    if is_ros2(kind.kind) != ros2:
         try:
             return _converted(kind, ros2=ros2, own=own or kind.converted_from == ROS2)
         except Exception as error:  # a bag library may raise anything
@@ -102,7 +101,7 @@ def _store(types: Any, known: Any = None) -> Any:
 
 
 def _converted(kind: MessageType, *, ros2: bool, own: bool) -> Form:
-    name = kind.kind if "/msg/" in kind.kind else kind.kind.replace("/", "/msg/", 1)
+    name = kind.kind.replace("/", "/msg/", 1) if ros2 else kind.kind
     source = _store(get_types_from_msg(_BOUND.sub("", kind.definition), name))
     # The newest of the distributions that robots have: where an older type is shorter, its readers leave out
     # what comes after.

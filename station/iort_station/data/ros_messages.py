@@ -20,6 +20,7 @@ from iort_contract.ros.definition import (
     VARIABLE,
     Definition,
     Field,
+    is_ros2,
     md5sum,
     parse,
 )
@@ -45,7 +46,7 @@ def types(cloud: Cloud, robot: str) -> dict[str, MessageType]:
 
 def in_ros1(kind: MessageType) -> MessageType:
     """A type of ROS 2 as one of ROS 1 that becomes ROS 2's again in a file that can hold it."""
-    if "/msg/" not in kind.kind:
+    if not is_ros2(kind.kind):
         return kind
     form = form_of(kind, ros2=False, own=True)
     return kind._replace(kind=form.kind, definition=form.definition, md5sum=form.md5sum, converted_from=ROS2)

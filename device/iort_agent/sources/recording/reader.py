@@ -9,6 +9,7 @@ bytes can stand for gigabytes.
 from __future__ import annotations
 
 import bz2
+import re
 import shutil
 import tempfile
 import traceback
@@ -107,6 +108,7 @@ MAX_INFLATED = 64 * 1024 * 1024
 _READ = 1024 * 1024
 # Where a file counts what it holds.
 INDEX = "the index"
+_RIHS01 = re.compile(rb"RIHS01_[0-9a-f]{64}")
 
 
 class Reader:
@@ -157,6 +159,18 @@ class Reader:
     def connections(self) -> list[Any]:
         """What the library knows of each connection of the files."""
         return [connection for part in self._parts for connection in part.connections]
+
+    def type_hash(self, connection: Any) -> str:
+        """The recorded hash of a connection's type: MD5, or ROS 2's RIHS01. Empty if there is none."""
+        if connection.digest:
+            return str(connection.digest)
+        # The library leaves out what MCAP says beside a channel; metadata.yaml may say it, too.
+        channel = getattr(connection.owner, "channels", {}).get(connection.id)
+        found = _RIHS01.search(getattr(channel, "metadata", b""))
+        if found:
+            return found.group().decode()
+        same = (connection.topic, connection.msgtype)
+        return next((c.digest for c in self._reader.connections if (c.topic, c.msgtype) == same), "")
 
     def counts(self) -> Mapping[str, Mapping[str, int]]:
         """Where messages are counted -> topic -> the number of its messages."""

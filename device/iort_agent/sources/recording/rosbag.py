@@ -1,4 +1,4 @@
-"""Makes samples of the messages in bags of ROS 1 and ROS 2: each message as ROS 1 has it.
+"""Makes samples of the messages in bags of ROS 1 and ROS 2: each message as it was recorded.
 
 A topic that cannot be read is left out, by name, and so is a message; the others are given. What was read is
 compared with what the recording says that it holds.
@@ -6,13 +6,12 @@ compared with what the recording says that it holds.
 
 from __future__ import annotations
 
+import hashlib
 import logging
-import re
 from collections import Counter
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Iterator, Mapping, NamedTuple, Optional, Sequence
+from typing import Any, Iterator, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.player import Message
@@ -20,31 +19,23 @@ from iort_agent.sources.recording.reader import INDEX, Reader, wrapped
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.ros.decode import Decoder, Large, stamp_ns
-from iort_contract.ros.definition import md5sum, parse
-from iort_contract.ros.message import ROS2, MessageType, RosMessage, RosType
+from iort_contract.ros.definition import parse
+from iort_contract.ros.message import MessageType, RosMessage, RosType
 
 _log = logging.getLogger(__name__)
 
 VESC_TYPE = "vesc_msgs/msg/VescStateStamped"
 # A header stamp this far from the time of recording comes from a clock that is not set, or a simulation.
 _BELIEVABLE_NS = 3600 * 1_000_000_000
-# A ROS 2 header has no seq, and a converted message has one. The definition may end the text.
-_ROS2_HEADER = re.compile(
-    r"(=+\nMSG: std_msgs/Header\n)\s*(?:time|builtin_interfaces/Time) stamp\n\s*string frame_id(\n|\Z)"
-)
-# ROS 2 may bound a text or an array, which changes nothing in its bytes.
-_BOUND = re.compile(r"(?<=string)<=\d+|(?<=\[)<=\d+(?=\])")
 
 
 class _Kind(NamedTuple):
-    """The type of a topic's messages, and the sample that declares it. ``convert`` makes messages of ROS 1 of
-    those of ROS 2."""
+    """The type of a topic's messages, and the sample that declares it."""
 
     whole: RosType
     sample: Optional[Mapping[str, Value]]  # noqa: UP045 - evaluated, on Python 3.8 too
     stamped: bool
     large: Optional[Decoder]  # noqa: UP045 - as above
-    convert: Optional[Callable[[bytes], bytes]]  # noqa: UP045 - as above
 
 
 class Unread:
@@ -83,7 +74,7 @@ class Recording:
         self._unread = unread
         self._large = large
         self._reader = Reader(path)
-        self._kinds: dict[tuple[str, str, str], _Kind] = {}
+        self._kinds: dict[_Key, _Kind] = {}
 
     def __enter__(self) -> Iterator[Message]:
         self._reader.open()
@@ -133,22 +124,14 @@ class Recording:
         """The messages of these topics, in the order of recording."""
         start_ns, counts = self._reader.start_ns, self._reader.counts()[INDEX]
         read: Counter[str] = Counter()
-        begun: set[tuple[str, str, str]] = set()
-        for connection, recorded_ns, recorded in self._reader.messages(lambda c: c.topic in streams):
-            topic, key = connection.topic, _key(connection)
-            kind, at_ns = self._kinds[key], recorded_ns - start_ns
+        begun: set[str] = set()
+        for connection, recorded_ns, raw in self._reader.messages(lambda c: c.topic in streams):
+            topic, kind, at_ns = connection.topic, self._kinds[_key(connection)], recorded_ns - start_ns
             read[topic] += 1
-            try:
-                raw = recorded if kind.convert is None else bytes(kind.convert(recorded))
-            except Exception as error:  # noqa: BLE001 - a bag library may raise anything
-                why = f"{type(error).__name__}: {error}"
-                line = f"{self._path}: topic {topic}: messages do not fit {connection.msgtype}: {why}"
-                self._unread.add(topic, 1, line)
-                continue
-            measured_ns = _measured_ns(raw, recorded_ns) if kind.stamped else recorded_ns
-            if key not in begun and kind.sample is not None:
+            measured_ns = self._measured_ns(raw, recorded_ns) if kind.stamped else recorded_ns
+            if kind.whole.id not in begun and kind.sample is not None:
                 yield Message(TYPES_STREAM, at_ns, measured_ns, kind.sample)
-            begun.add(key)
+            begun.add(kind.whole.id)
             contents: dict[str, Any] = {}
             if kind.large is not None:
                 with suppress(MessageError):
@@ -166,70 +149,63 @@ class Recording:
 
     def _kind(self, stream: str, connection: Any) -> _Kind:
         name = _named(connection.msgtype)
-        kind, convert = name.replace("/msg/", "/"), None
+        kind = name if self._reader.is2 else name.replace("/msg/", "/")
         with wrapped(f"{self._path}: topic {connection.topic}: its type {kind} cannot be read"):
-            # As recorded: with constants and comments. rosbags for Python 3.8 has the text itself.
-            text, md5 = getattr(connection.msgdef, "data", connection.msgdef), connection.digest
-            if self._reader.is2:
-                store = self._store(connection, name)
-                text, _ = store.generate_msgdef(name, ros_version=1)
-                text = _ROS2_HEADER.sub(r"\1uint32 seq\ntime stamp\nstring frame_id\2", text)
-                text = _BOUND.sub("", text)
-                md5 = md5sum(parse(kind, text), text)
-                convert = partial(store.cdr_to_ros1, typename=name)
+            text = self._definition(connection, name)
             definition = parse(kind, text)
+        digest = self._reader.type_hash(connection)
+        digest = digest or f"sha256_{hashlib.sha256(text.encode()).hexdigest()}"
         sample = None
         try:
-            sample = MessageType(
-                stream, connection.topic, kind, md5, text, converted_from=ROS2 if self._reader.is2 else ""
-            ).sample()
+            sample = MessageType(stream, connection.topic, kind, digest, text).sample()
         except ContractError as error:
             _log.warning("%s: topic %s: %s", self._path, connection.topic, error)
         large = Decoder(definition, large=True) if self._large else None
-        return _Kind(RosType(connection.topic, kind, md5, text), sample, definition.stamped(), large, convert)
+        return _Kind(RosType(connection.topic, kind, digest, text), sample, definition.stamped(), large)
 
-    def _store(self, connection: Any, name: str) -> Any:
-        """The library's types for one connection: two topics may define one name differently."""
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - optional
-        from rosbags.typesys import get_types_from_idl as from_idl  # noqa: PLC0415 - as above
+    def _measured_ns(self, raw: bytes, recorded_ns: int) -> int:
+        """The header stamp, or the time of recording if the stamp is missing or not believable."""
+        t_ns = stamp_ns(raw, ros2=self._reader.is2)
+        return t_ns if t_ns is not None and abs(t_ns - recorded_ns) < _BELIEVABLE_NS else recorded_ns
+
+    def _definition(self, connection: Any, name: str) -> str:
+        """The definition as recorded, with constants and comments; of IDL, or of a type that the recording
+        does not define, the library's text."""
+        from rosbags.typesys import Stores, get_types_from_idl, get_typestore  # noqa: PLC0415 - optional
 
         # rosbags for Python 3.8 has the text itself, and no format beside it.
-        text = getattr(connection.msgdef, "data", connection.msgdef)
+        text: str = getattr(connection.msgdef, "data", connection.msgdef)
         form = getattr(getattr(connection.msgdef, "format", None), "name", "MSG" if text else "NONE")
-        if form == "NONE":
-            store = _known_types()
-        else:
-            store, types = get_typestore(Stores.EMPTY), {}
-            if text.startswith(_IDL):
-                for part in text.split(_SEPARATOR)[1:]:
-                    types.update(from_idl(part.partition("\n")[2]))
-            else:
-                types = from_idl(text) if form == "IDL" else get_types_from_msg(text, name)
-            store.register(types)
+        is_idl = form == "IDL" or text.startswith(_IDL)
+        if not self._reader.is2 or (form != "NONE" and not is_idl):
+            return text
+        store = get_typestore(Stores.EMPTY) if is_idl else _known_types()
+        if is_idl:
+            parts = [part.partition("\n")[2] for part in text.split(_SEPARATOR)[1:]]
+            for part in parts if text.startswith(_IDL) else [text]:
+                store.register(get_types_from_idl(part))
         # Renamed between the versions for Python 3.8 and later.
         if name not in (store.fielddefs if hasattr(store, "fielddefs") else store.FIELDDEFS):
             raise SourceError(
                 f"{self._path}: the topic {connection.topic} is of type {name}, whose definition is neither "
                 "in the recording nor known to the agent; `ros2 bag convert` into MCAP adds it"
             )
-        return store
+        generated: str = store.generate_msgdef(name, ros_version=2)[0]
+        return generated
 
 
-def _key(connection: Any) -> tuple[str, str, str]:
-    # One name may have two definitions, each with its own connection.
-    return connection.topic, connection.msgtype, connection.digest
+# One name may have two definitions, each with its own connection. Not every format has hashes of them.
+_Key = Tuple[str, str, str, object]
+
+
+def _key(connection: Any) -> _Key:
+    return connection.topic, connection.msgtype, connection.digest, connection.msgdef
 
 
 def _named(msgtype: str) -> str:
     """The type's name as the library has it. Some recorders leave out the middle."""
     package, _, name = msgtype.partition("/")
     return f"{package}/msg/{name}" if name and "/" not in name else msgtype
-
-
-def _measured_ns(raw: bytes, recorded_ns: int) -> int:
-    """The header stamp, or the time of recording if the stamp is missing or not believable."""
-    t_ns = stamp_ns(raw)
-    return t_ns if t_ns is not None and abs(t_ns - recorded_ns) < _BELIEVABLE_NS else recorded_ns
 
 
 _SEPARATOR = "=" * 80 + "\n"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import struct
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,6 +32,8 @@ START = 1_600_000_000_000_000_000
 
 # The newest rosbags for Python 3.8 writes ROS 2 recordings in one format only.
 STORAGES = ["mcap", "sqlite3"] if hasattr(rosbag2, "StoragePlugin") else ["sqlite3"]
+
+LINE = "=" * 80 + "\n"
 
 Sample = Tuple[str, int, Any]
 
@@ -94,19 +98,30 @@ def test_what_is_played_is_what_was_recorded_byte_for_byte(tmp_path: Path, speed
         assert kind.id == type_id(topic, named, checksums[topic])
 
 
+def recorded_by_ros2(folder: Path, topic: str) -> tuple[Any, list[bytes]]:
+    """A topic's connection and the bytes of its messages, as rosbags reads them."""
+    with rosbag2.Reader(folder) as reader:
+        (connection,) = (c for c in reader.connections if c.topic == topic)
+        return connection, [bytes(raw) for _, _, raw in reader.messages(connections=[connection])]
+
+
 @pytest.mark.parametrize("storage", STORAGES)
-def test_what_ros_2_recorded_is_a_message_of_ros_1(tmp_path: Path, storage: str) -> None:
+@pytest.mark.parametrize("topic", ["/sensors/core", "/odd"])
+def test_what_ros_2_recorded_is_kept_byte_for_byte(tmp_path: Path, storage: str, topic: str) -> None:
     folder = write_ros2(tmp_path / "drive", storage)
-    said, *samples = play_all(folder)
-    kind = message_type(said[2])
-    store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(kind.definition, VESC_TYPE))
-    assert store.generate_msgdef(VESC_TYPE, ros_version=1)[1] == kind.md5sum
-    for i, (_, _, values) in enumerate(samples):
-        message = store.deserialize_ros1(values.raw, VESC_TYPE)
-        at = START + i * 100_000_000
-        assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(at, 10**9)
-        assert {name: getattr(message.state, name) for name in values} == dict(values)
+    said, *samples = play_all(folder, topics=((topic, "made"),))
+    kind, (connection, raws) = message_type(said[2]), recorded_by_ros2(folder, topic)
+    assert (kind.topic, kind.kind, kind.converted_from) == (topic, connection.msgtype, "")
+    assert kind.md5sum == connection.digest == ros2_store().hash_rihs01(connection.msgtype)
+    assert kind.definition == getattr(connection.msgdef, "data", connection.msgdef)
+    assert [values.raw for _, _, values in samples] == raws
+    assert {values.kind.id for _, _, values in samples} == {kind.id}
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_original_stamps_of_ros_2_are_the_headers(tmp_path: Path, storage: str) -> None:
+    samples = play(write_ros2(tmp_path / "drive", storage, late_ns=5_000_000), stamps="original")
+    assert [t_us for _, t_us, _ in samples] == [START // 1000 + i * 100_000 - 5_000 for i in range(10)]
 
 
 STATE_ROS1 = "int32 FAULT_CODE_NONE=0\nfloat64 speed\nint32 fault_code\n"
@@ -158,7 +173,7 @@ def ros2_writer(path: Path, storage: str) -> rosbag2.Writer:
     return rosbag2.Writer(path, version=8, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
 
 
-def write_ros2(path: Path, storage: str, *, count: int = 10) -> Path:
+def write_ros2(path: Path, storage: str, *, count: int = 10, late_ns: int = 0) -> Path:
     store = ros2_store()
     types = store.types
     names = [name for name, field in VESC_FIELDS.items() if 2 in field.ros]
@@ -168,7 +183,8 @@ def write_ros2(path: Path, storage: str, *, count: int = 10) -> Path:
         odd = writer.add_connection("/odd", "lab_msgs/msg/Odd", typestore=store)
         for i in range(count):
             at = START + i * 100_000_000
-            stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
+            sec, nanosec = divmod(at - late_ns, 10**9)
+            stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
             header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
             values = {name: k + i if name in whole else k + i + 0.5 for k, name in enumerate(names)}
             state = types["vesc_msgs/msg/VescState"](**values)
@@ -276,8 +292,12 @@ def strip_definitions(folder: Path) -> None:
 
 def test_ros_2_without_definitions_knows_the_vesc_but_not_the_labs_types(tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "drive", "sqlite3")
+    _, raws = recorded_by_ros2(folder, "/sensors/core")
     strip_definitions(folder)
-    assert len(play(folder)) == 10
+    said, *samples = play_all(folder)
+    assert [values.raw for _, _, values in samples] == raws
+    assert {values["voltage_input"] for _, _, values in samples} == {i + 0.5 for i in range(10)}
+    assert "float64 voltage_input\n" in message_type(said[2]).definition
     with pytest.raises(SourceError, match=r"/odd is of type lab_msgs/msg/Odd, whose definition"):
         play(folder, topics=(("/odd", "odd"),))
 
@@ -365,7 +385,9 @@ def test_messages_that_are_counted_and_not_there_are_told_by_topic(tmp_path: Pat
     assert [finding.level for finding in BagConfig(path=path).check("a")] == [*told, OK]
 
 
-def write_mcap(path: Path, *topics: tuple[str, str, str, bytes], count: int = 1) -> Path:
+def write_mcap(
+    path: Path, *topics: tuple[str, str, str, bytes], count: int = 1, form: str = "ros2msg", rihs01: str = ""
+) -> Path:
     """An MCAP file with messages of each topic: its name, type, definition and bytes."""
     from mcap.writer import CompressionType, Writer
 
@@ -373,8 +395,8 @@ def write_mcap(path: Path, *topics: tuple[str, str, str, bytes], count: int = 1)
         writer = Writer(file, chunk_size=100, compression=CompressionType.NONE)
         writer.start(profile="ros2", library="test")
         for topic, kind, definition, _ in topics:
-            schema = writer.register_schema(kind, "ros2msg", definition.encode())
-            writer.register_channel(topic, "cdr", schema)
+            schema = writer.register_schema(kind, form, definition.encode())
+            writer.register_channel(topic, "cdr", schema, {"topic_type_hash": rihs01} if rihs01 else {})
         for i in range(count):
             for channel, (_, _, _, raw) in enumerate(topics, 1):
                 writer.add_message(channel, START + i, raw, START + i)
@@ -407,22 +429,54 @@ def test_a_chunk_that_the_index_leaves_out_is_told(tmp_path: Path) -> None:
 
 @needs_mcap
 def test_a_topic_that_cannot_be_read_is_left_out_alone(tmp_path: Path) -> None:
+    lost = ("/lost", "lab_msgs/msg/Lost", "Part part\n", b"\0\1\0\0\1")
     wide = ("/wide", "lab_msgs/msg/Wide", "wstring name\n", b"\0\1\0\0\1\0\0\0a\0\0\0")
-    swapped = ("/swapped", SERVO[1], SERVO[2], b"\0\0\0\0" + bytes(8))
+    swapped = ("/swapped", SERVO[1], SERVO[2], b"\0\0\0\0?\xf0" + bytes(6))
     short = ("/short", SERVO[1], SERVO[2], b"\0\1\0\0" + bytes(2))
-    path = write_mcap(tmp_path / "a.mcap", SERVO, wide, swapped, short, count=3)
-    topics = tuple((topic, topic[1:]) for topic in ("/servo", "/wide", "/swapped", "/short"))
+    kept = (SERVO, wide, swapped, short)
+    path = write_mcap(tmp_path / "a.mcap", *kept, lost, count=3)
+    topics = tuple((topic, topic[1:]) for topic, *_ in (*kept, lost))
     samples, error, report = refused(path, topics=topics)
-    assert [stream for stream, _, _ in samples] == ["servo"] * 3
-    for part in (
-        "/wide",
-        "wstring",
-        "topic /swapped: messages do not fit",
-        "little-endian",
-        "topic /short: ",
-    ):
+    # As live ones, messages are kept whatever they hold.
+    assert [values.raw for _, _, values in samples] == [raw for *_, raw in kept] * 3
+    assert [dict(values) for _, _, values in samples[:4]] == [{"data": 0.0}, {"name": "a"}, {"data": 1.0}, {}]
+    for part in ("/lost", "lab_msgs/Part is missing"):
         assert part in error
-    assert report == {topic: {"unread": 3} for topic in ("/wide", "/swapped", "/short")}
+    assert report == {"/lost": {"unread": 3}}
+
+
+@needs_mcap
+def test_the_hash_that_an_mcap_has_beside_a_channel_is_read(tmp_path: Path) -> None:
+    rihs01 = "RIHS01_" + "a1" * 32
+    path = write_mcap(tmp_path / "a.mcap", SERVO, rihs01=rihs01)
+    found = [values for stream, _, values in play_all(path, topics=(("/servo", "servo"),))]
+    assert (message_type(found[0]).md5sum, found[1].raw) == (rihs01, SERVO[3])
+
+
+@needs_mcap
+def test_a_recording_without_hashes_tells_two_definitions_of_one_name_apart(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", SERVO, (*SERVO[:2], "float32 data\n", SERVO[3][:8]))
+    said, first, said_next, second = (values for _, _, values in play_all(path, topics=(("/servo", "s"),)))
+    kinds = [message_type(one) for one in (said, said_next)]
+    assert [kind.definition for kind in kinds] == ["float64 data\n", "float32 data\n"]
+    assert [kind.md5sum for kind in kinds] == [
+        f"sha256_{hashlib.sha256(kind.definition.encode()).hexdigest()}" for kind in kinds
+    ]
+    assert [first.kind.id, second.kind.id] == [kind.id for kind in kinds]
+
+
+@needs_mcap
+def test_a_definition_of_idl_is_written_as_a_message(tmp_path: Path) -> None:
+    part = 'module lab_msgs { module msg { struct Part { @unit(value="m") double x; }; }; };\n'
+    whole = "module lab_msgs { module msg { struct Whole { lab_msgs::msg::Part part; long n; }; }; };\n"
+    text = f"{LINE}IDL: lab_msgs/msg/Whole\n{whole}{LINE}IDL: lab_msgs/msg/Part\n{part}"
+    raw = b"\0\1\0\0" + struct.pack("<di", 1.5, -7)
+    path = write_mcap(tmp_path / "a.mcap", ("/whole", "lab_msgs/msg/Whole", text, raw), form="ros2idl")
+    said, values = (values for _, _, values in play_all(path, topics=(("/whole", "whole"),)))
+    assert (
+        message_type(said).definition == f"lab_msgs/Part part\nint32 n\n{LINE}MSG: lab_msgs/Part\nfloat64 x\n"
+    )
+    assert (values.raw, dict(values)) == (raw, {"part.x": 1.5, "n": -7})
 
 
 @needs_mcap

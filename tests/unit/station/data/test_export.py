@@ -10,21 +10,23 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from iort_agent.lanes.streams import BatchEncoder
 from iort_agent.sources import Emit
 from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.sources.recording import BagConfig
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.ros.decode import Large
-from iort_contract.ros.message import Messages, MessageType, RosType, cut
+from iort_contract.ros.message import ROS2, Messages, MessageType, RosMessage, RosType, cut
 from iort_contract.topics import RECORD, build_topic
 from iort_station.data import bags
 from iort_station.data.export import Export, write
@@ -301,7 +303,7 @@ PAIR = (
 
 
 @pytest.mark.parametrize("topic", ["/sensors/core", "/odd", "/pair"])
-def test_what_ros_2_recorded_is_exported_in_its_form(tmp_path: Path, topic: str) -> None:
+def test_what_ros_2_recorded_is_exported_byte_for_byte(tmp_path: Path, topic: str) -> None:
     if topic == "/pair":
         source = write_mcap(tmp_path / "drive.mcap", PAIR)
     else:
@@ -310,23 +312,112 @@ def test_what_ros_2_recorded_is_exported_in_its_form(tmp_path: Path, topic: str)
     def play(emit: Emit, clock: ManualClock) -> None:
         BagConfig(path=source, topics=((topic, "made"),)).build(clock).run(emit, Event())
 
-    cloud, path = stored(play), tmp_path / "made.mcap"
-    lines: list[str] = []
-    with bags.mcap(path) as file:
-        write(cloud, select("car", "made"), file, say=lines.append)
-    assert "of ROS 2, converted to ROS 1 when they were recorded and back for this file" in lines[0]
-    assert read_ros2(path, topic) == read_ros2(source, topic)
-    with bags.bag(tmp_path / "made.bag") as bag:
-        write(cloud, select("car", "made"), bag, say=lines.append)
-    assert lines[-1].endswith("of ROS 2, converted to ROS 1 when they were recorded")
+    notes = notes_of(stored(play), tmp_path)
+    assert notes[".mcap"] == notes[""] == ["as they were published"]
+    assert "of ROS 2, converted to ROS 1" in notes[".bag"][0]
+    want = of_ros2(source, topic)
+    assert len(want) == (1 if topic == "/pair" else 10)
+    assert of_ros2(tmp_path / "made.mcap", topic) == of_ros2(tmp_path / "made", topic) == want
 
 
-def read_ros2(path: Path, topic: str) -> list[tuple[str, str, str, bytes]]:
-    """Type, encodings and bytes of a topic's messages in an MCAP file of ROS 2."""
-    with path.open("rb") as file:
-        reader = make_reader(file)
-        assert reader.get_header().profile == "ros2"
+def notes_of(cloud: Any, folder: Path) -> dict[str, list[str]]:
+    """Export a stream into a file of each kind, and return what is said of its messages."""
+    notes: dict[str, list[str]] = {}
+    for ending, kind in bags.KINDS.items():
+        lines: list[str] = []
+        with kind(folder / f"made{ending}") as file:
+            write(cloud, select("car", "made"), file, say=lines.append)
+        notes[ending] = [line.partition(", ")[2] for line in lines]
+    return notes
+
+
+def of_ros2(path: Path, topic: str) -> list[tuple[str, str, bytes]]:
+    """Type, definition and bytes of a topic's messages in a recording of ROS 2."""
+    with AnyReader([path]) as reader:
         return [
-            (schema.name, schema.encoding, channel.message_encoding, message.data)
-            for schema, channel, message in reader.iter_messages(topics=[topic])
+            (connection.msgtype, connection.msgdef.data, bytes(raw))
+            for connection, _, raw in reader.messages()
+            if connection.topic == topic
         ]
+
+
+# Recorded by an agent that made messages of ROS 1 of those of ROS 2.
+OLD = MessageType("made", "/pair", "lab_msgs/Pair", "1" * 32, PAIR[2].rpartition("uint8")[0], ROS2)
+_STORE = get_typestore(Stores.EMPTY)
+_STORE.register(get_types_from_msg(PAIR[2], PAIR[1]))
+NEW = MessageType("made", "/pair", PAIR[1], _STORE.hash_rihs01(PAIR[1]), PAIR[2])
+
+
+def emitted(*messages: tuple[MessageType, bytes]) -> Any:
+    """The cloud after these messages of a stream, ten a second, each kind with its type."""
+
+    def play(emit: Emit, clock: ManualClock) -> None:
+        kinds = {}
+        for kind, raw in messages:
+            if kind not in kinds:
+                kinds[kind] = RosType(kind.topic, kind.kind, kind.md5sum, kind.definition)
+                emit(TYPES_STREAM, clock.now_us(), kind.sample())
+            emit("made", clock.now_us(), RosMessage(raw, kinds[kind]))
+            clock.advance(0.1)
+
+    return stored(play)
+
+
+def test_a_stream_may_have_messages_that_were_converted_and_later_ones_that_were_not(tmp_path: Path) -> None:
+    raw = PAIR[3]
+    notes = notes_of(emitted((OLD, raw[12:]), (NEW, raw), (NEW, raw)), tmp_path)
+    before = "of ROS 2, converted to ROS 1 when they were recorded"
+    assert notes[".mcap"] == [f"{before} and back for this file", "as they were published"]
+    assert notes[".bag"] == [before, "of ROS 2, converted to ROS 1"]
+    for path in ("made.mcap", "made"):
+        assert [found[2] for found in of_ros2(tmp_path / path, "/pair")] == [raw] * 3
+
+
+def test_a_message_that_cannot_be_converted_is_left_out_and_counted(tmp_path: Path) -> None:
+    notes = notes_of(emitted((NEW, PAIR[3]), (NEW, PAIR[3][:9]), (NEW, PAIR[3])), tmp_path)
+    assert notes[".mcap"] == ["as they were published"]
+    with Reader(tmp_path / "made.bag") as reader:
+        assert reader.message_count == 2
+    assert len(of_ros2(tmp_path / "made.mcap", "/pair")) == 3
+
+
+def test_samples_of_ros_2_become_messages_of_it_and_so_do_those_beside_them(tmp_path: Path) -> None:
+    name, jazzy = "geometry_msgs/msg/PointStamped", get_typestore(Stores.ROS2_JAZZY)
+    text, _ = jazzy.generate_msgdef(name, ros_version=2)
+    kind = MessageType("made", "/point", name, jazzy.hash_rihs01(name), text)
+
+    def play(emit: Emit, clock: ManualClock) -> None:
+        emit(TYPES_STREAM, clock.now_us(), kind.sample())
+        for n in range(3):
+            emit("made", clock.now_us(), {"x": n / 4, "z": None})
+            # Its fields change.
+            emit("rtt-2", clock.now_us(), {"ms": n / 2} if n < 2 else {"ms": 1.0, "lost": n})
+            clock.advance(2)
+
+    cloud = stored(play)
+    for ending, make in bags.KINDS.items():
+        with make(tmp_path / f"ride{ending}") as file:
+            lines: list[str] = []
+            for stream in ("made", "rtt-2"):
+                write(cloud, select("car", stream), file, say=lines.append)
+        middle = "/" if ending == ".bag" else "/msg/"
+        assert (
+            lines[0]
+            == f"car made: 3 messages of geometry_msgs{middle}PointStamped on /point, made of samples"
+        )
+        assert (
+            lines[2]
+            == f"car rtt-2: 3 messages of iort_msgs{middle}Rtt_2_2 on /rtt_2, /rtt_2_2, made of samples"
+        )
+        assert lines[4] == "its fields changed, so there are 2 types, each on a topic of its own"
+        with AnyReader([tmp_path / f"ride{ending}"]) as reader:
+            found = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+        points = [message for topic, message in found if topic == "/point"]
+        assert [(one.point.x, np.isnan(one.point.z)) for one in points] == [
+            (0, True),
+            (0.25, True),
+            (0.5, True),
+        ]
+        assert [one.header.stamp.sec - T0_US // 1_000_000 for one in points] == [0, 2, 4]
+        assert [message.ms for topic, message in found if topic.startswith("/rtt_2")] == [0, 0.5, 1]
+        assert [message.lost for topic, message in found if topic == "/rtt_2_2"][-1] == 2
