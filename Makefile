@@ -14,10 +14,10 @@ help: ## show this
 setup: ## set up .venv, node_modules and build/, nothing outside this folder
 	@$(PYTHON) scripts/setup.py
 
-demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag FAULTS=flat_tyre:strong LIVE=pubnub REPORT=report.json PORT=8080
+demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag FAULTS=flat_tyre:strong ROS2=1 LIVE=pubnub REPORT=report.json PORT=8080
 	@$(BIN)/python -m local.demo $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
 		$(if $(FAULTS),--faults "$(FAULTS)") $(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT)) \
-		$(if $(LIVE),--live $(LIVE))
+		$(if $(LIVE),--live $(LIVE)) $(if $(ROS2),--ros2)
 
 # The options of the cloud that is kept.
 STATE_OPTION = $(if $(STATE),--state "$(STATE)")

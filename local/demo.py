@@ -43,6 +43,7 @@ from iort_station.page.listening import listening
 from iort_station.page.live import Listening
 from iort_station.page.motion import reaching
 from iort_station.page.server import PageServer
+from local import ros2_car
 from local.cloud import FOLDER, EmbeddedCloud
 from local.deployment import ROOT
 from local.figures import Figures, Spread, round_trips
@@ -53,8 +54,8 @@ def read() -> argparse.Namespace:
     """The options; ends the process with an error if one is wrong."""
     parser = argparse.ArgumentParser(
         prog="make demo",
-        usage="make demo [DURATION=20] [BAG=drive.bag] [FAULTS=kind:strength] [LIVE=pubnub] [REPORT=r.json] "
-        "[PORT=8080]",
+        usage="make demo [DURATION=20] [BAG=drive.bag] [FAULTS=kind:strength] [ROS2=1] [LIVE=pubnub] "
+        "[REPORT=r.json] [PORT=8080]",
         description="A car drives through the embedded cloud, and the demo counts the samples that arrive.",
     )
     parser.add_argument("--duration", type=_positive, metavar="S", help="seconds to drive (default 60)")
@@ -63,6 +64,9 @@ def read() -> argparse.Namespace:
     )
     parser.add_argument(
         "--faults", type=_faults, default=[], metavar="KIND:STRENGTH,...", help="of the simulated car"
+    )
+    parser.add_argument(
+        "--ros2", action="store_true", help="simulate the car in a ROS 2 graph, which the agent joins"
     )
     parser.add_argument(
         "--live",
@@ -84,8 +88,13 @@ def read() -> argparse.Namespace:
                 next(messages, None)
         except SourceError as error:
             parser.error(f"BAG={error}")
-        if options.faults:
-            parser.error("FAULTS are those of a simulated car: give no BAG")
+        if options.faults or options.ros2:
+            parser.error("FAULTS and ROS2 are of a simulated car: give no BAG")
+    if options.ros2:
+        try:
+            options.ros2 = ros2_car.find()
+        except LocalError as error:
+            parser.error(str(error))
     if options.report is not None and not options.report.absolute().parent.is_dir():
         parser.error(f"REPORT must be in an existing folder, got {options.report}")
     if options.report is not None and options.report.is_dir():
@@ -128,6 +137,7 @@ def _positive(value: str) -> float:
 
 
 ROBOT = "car1"
+ROBOT_LOG = "ros2-car.log"
 _SOURCE_RATE_HZ = 50
 # Ten pings a second of half a kilobyte over each path.
 _PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
@@ -173,6 +183,8 @@ class _Demo:
     def __init__(self, given: argparse.Namespace, console: Console, stopped: threading.Event) -> None:
         self._options, self._console, self._stopped = given, console, stopped
         self._began = time.monotonic()
+        # What a car of its own process says that it has published.
+        self._published: int | None = None
 
     def run(self) -> Figures:
         with ExitStack() as stack:
@@ -223,31 +235,59 @@ class _Demo:
     def _step(self, name: str) -> None:
         self._console.print(f"{time.monotonic() - self._began:5.1f} s  {name}", highlight=False)
 
-    def _settings(self) -> dict[str, Any]:
-        source: dict[str, Any]
+    def _settings(self, *, ends: bool = True) -> dict[str, Any]:
         if self._options.bag is not None:
-            source = {"type": "bag", "path": str(self._options.bag.resolve())}
-        else:
-            faults = {"faults": self._options.faults} if self._options.faults else {}
-            source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": _SOURCE_RATE_HZ, **faults}
-        duration_s = self._options.duration
-        if duration_s is None and self._options.bag is None:
-            duration_s = 60.0
-        if duration_s is not None:
-            source["duration_s"] = duration_s
-        settings = {"sources": [source], "ping": _PING}
-        return settings if self._options.bag is not None else {**settings, "downlink": DOWNLINK}
+            given = {"duration_s": self._options.duration} if self._options.duration and ends else {}
+            loop = {} if ends else {"loop": True}
+            bag = {"type": "bag", "path": str(self._options.bag.resolve()), **given, **loop}
+            return {"sources": [bag], "ping": _PING}
+        ros2: ros2_car.Ros2 | None = self._options.ros2 or None
+        if ros2 is not None:
+            downlink = ros2.downlink(MAX_LEASE_MS)
+            return {"sources": [ros2.source()], "ping": _PING, "downlink": downlink}
+        return {"sources": [{"type": "sim", **self._car(ends=ends)}], "ping": _PING, "downlink": DOWNLINK}
+
+    def _car(self, *, ends: bool) -> dict[str, Any]:
+        """The settings of the simulated car."""
+        faults = {"faults": self._options.faults} if self._options.faults else {}
+        duration = {"duration_s": self._options.duration or 60.0} if ends else {}
+        return {"stream": VESC_STREAM, "rate_hz": _SOURCE_RATE_HZ, **faults, **duration}
+
+    @contextmanager
+    def _robot(self, embedded: EmbeddedCloud, *, ends: bool) -> Iterator[Child | None]:
+        """The simulated car in the ROS 2 graph; None if the agent simulates it."""
+        if not self._options.ros2:
+            yield None
+            return
+        command = [sys.executable, "-m", "local.ros2_car", "--settings", json.dumps(self._car(ends=ends))]
+        environment = {**self._options.ros2.environment, "HOME": str(embedded.folder)}
+        log = embedded.folder / ROBOT_LOG
+        robot = Child("the car", command, environment=environment, cwd=ROOT, log=log)
+        try:
+            yield robot
+        finally:
+            robot.stop()
 
     def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listening) -> dict[str, Any]:
         report = embedded.folder / "agent-report.json"
         # The figures are of a car that somebody looks at from its start.
         viewer = Viewer(embedded.cloud, [ROBOT], every_s=_LOOK_S, broker=embedded.live == IOT)
-        with viewer, _agent(embedded, bundle, "--report", str(report)) as agent:
+        with (
+            viewer,
+            self._robot(embedded, ends=True) as robot,
+            self._agent(embedded, bundle, "--report", str(report)) as agent,
+        ):
             began = time.monotonic()
             with self._console.status("starting the agent") as status:
-                while self._running(agent):
+                while self._running(agent) and (robot is None or robot.poll() is None):
                     embedded.emulator.check()
                     status.update(self._status_line(embedded, listener, time.monotonic() - began))
+            if robot is not None:
+                if robot.poll() != 0:
+                    raise LocalError(robot.ended() if robot.poll() else f"the agent ended:\n{agent.tail()}")
+                self._published = ros2_car.published(embedded.folder / ROBOT_LOG)
+                agent.interrupt()
+                agent.wait(_STANDS_S)
             if not report.exists():
                 raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
             if agent.poll():
@@ -264,7 +304,8 @@ class _Demo:
         return agent.wait(_STATUS_S) is None
 
     def _status_line(self, embedded: EmbeddedCloud, listener: Listening, seconds: float) -> str:
-        stored = sum(len(b.times_us) for b in audit.batches(embedded.cloud, ROBOT, VESC_STREAM))
+        stream = self._options.ros2.stream if self._options.ros2 else VESC_STREAM
+        stored = sum(len(b.times_us) for b in audit.batches(embedded.cloud, ROBOT, stream))
         heard = list(listener.heard)
         delay = f"{heard[-1].delay_ms:.0f} ms" if heard else "-"
         return (
@@ -275,7 +316,9 @@ class _Demo:
     def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listening) -> Figures:
         """Read the tables until Lambda 2 has summarised every sample, or has done nothing for a minute."""
         streams = [name for name in report["streams"] if name not in OWN_STREAMS]
-        sent = sum(report["streams"][name]["samples"] for name in streams)
+        sent = self._published
+        if sent is None:
+            sent = sum(report["streams"][name]["samples"] for name in streams)
         before, deadline = -1, 0.0
         while True:
             found = [audit.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
@@ -299,36 +342,37 @@ class _Demo:
 
     def _stay(self, embedded: EmbeddedCloud, bundle: robots.Bundle, url: str) -> None:
         """Let the car drive on until Ctrl-C, for the page."""
-        settings = self._settings()
-        settings["sources"][0].pop("duration_s", None)
-        if self._options.bag is not None:
-            settings["sources"][0]["loop"] = True
-        robots.configure(bundle, settings)
+        robots.configure(bundle, self._settings(ends=False))
         self._console.print(
             f"\nThe car drives on: {url}  Ctrl-C stops everything.", highlight=False, soft_wrap=True
         )
-        with _agent(embedded, bundle) as agent:
+        with self._robot(embedded, ends=False), self._agent(embedded, bundle) as agent:
             while self._running(agent):
                 embedded.emulator.check()
             raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
 
-
-@contextmanager
-def _agent(embedded: EmbeddedCloud, bundle: robots.Bundle, *arguments: str) -> Iterator[Child]:
-    command = [str(Path(sys.executable).parent / "iort-agent"), "--config", str(bundle.config), *arguments]
-    agent = Child(
-        "the agent",
-        command,
-        environment={"PATH": "", "HOME": str(embedded.folder)},
-        cwd=ROOT,
-        log=embedded.folder / "agent.log",
-    )
-    try:
-        yield agent
-    finally:
-        agent.interrupt()
-        agent.wait(15.0)
-        agent.stop()
+    @contextmanager
+    def _agent(self, embedded: EmbeddedCloud, bundle: robots.Bundle, *arguments: str) -> Iterator[Child]:
+        command = [
+            str(Path(sys.executable).parent / "iort-agent"),
+            "--config",
+            str(bundle.config),
+            *arguments,
+        ]
+        ros2: dict[str, str] = self._options.ros2.environment if self._options.ros2 else {"PATH": ""}
+        agent = Child(
+            "the agent",
+            command,
+            environment={**ros2, "HOME": str(embedded.folder)},
+            cwd=ROOT,
+            log=embedded.folder / "agent.log",
+        )
+        try:
+            yield agent
+        finally:
+            agent.interrupt()
+            agent.wait(15.0)
+            agent.stop()
 
 
 if __name__ == "__main__":

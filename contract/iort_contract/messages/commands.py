@@ -137,13 +137,14 @@ DRIVEN_BY_ANOTHER, EMERGENCY_STOP, BEGIN_AGAIN, SETTINGS_UNKNOWN, NO_GUARD = (
     "settings_unknown",
     "guard_not_ready",
 )
-# The ROS type of a car that a stick drives, as the simulated one.
+# The type of a car that a stick drives, as the simulated one, in ROS 1 and in ROS 2.
 DRIVE_TYPE = "ackermann_msgs/AckermannDriveStamped"
+ROS2_DRIVE_TYPE = "ackermann_msgs/msg/AckermannDriveStamped"
 # Above `downlink` in a car.yaml that is written for a simulated car.
 DOWNLINK_NOTE = """\
 # What `iort drive`, `iort send` and the page move, and what the emergency stop ends: without a command with
-# motion, a stop does nothing. These are the simulated car's. For a ROS 1 car, name its own topic and type
-# (docs/how-to/drive.md); a car without ROS 1 cannot be moved by commands: remove the section.
+# motion, a stop does nothing. These are the simulated car's. For a car with ROS, name its own topic and type
+# (docs/how-to/drive.md); a car without ROS cannot be moved by commands: remove the section.
 """
 # Why a robot rejects a stop, and what its operators are told before they need one.
 NO_MOTION = "nothing to stop: downlink.cmd has no command with motion"

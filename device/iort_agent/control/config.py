@@ -49,6 +49,7 @@ from iort_contract.messages.commands import (
 )
 from iort_contract.messages.questions import INVALID, MAX_ASK_MS
 from iort_contract.messages.shadow import MOTION_STOPPED, SETTINGS
+from iort_contract.ros.definition import is_ros2
 from iort_contract.topics import check_stream
 
 ROBOT_IN_TOPIC = "{robot}"
@@ -83,10 +84,6 @@ def _object(value: Any, place: Place) -> Any:
     if not isinstance(value, dict):
         raise place.error(value, "a mapping of the ROS message's fields")
     return value
-
-
-def _ros_of(kind: str) -> int:
-    return 2 if kind.count("/") == 2 else 1
 
 
 class RosGraph(NamedTuple):
@@ -215,11 +212,13 @@ class DownlinkConfig:
             for section, entries in (("cmd", self.cmd), ("fleet", self.fleet))
             for name, settings in entries
         }
-        versions = set(nodes) if len(nodes) == 1 else {_ros_of(kind) for kind in types.values()} or set(nodes)
+        versions = (
+            set(nodes) if len(nodes) == 1 else {1 + is_ros2(kind) for kind in types.values()} or set(nodes)
+        )
         # Without any of them, the ROS that was sourced.
         version = max(versions or {2 if os.environ.get("ROS_VERSION") == "2" else 1})
         for key, kind in types.items():
-            if _ros_of(kind) != version:
+            if is_ros2(kind) != (version == 2):
                 form = kind.replace("/", "/msg/") if version == 2 else kind.replace("/msg/", "/")
                 raise ContractError(f"{key} must be {form}, as the graph is of ROS {version}, got {kind}")
         return RosGraph(version, nodes.get(version))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import threading
 from typing import Callable, Mapping, Sequence
 
@@ -20,6 +21,8 @@ from iort_contract.topics import FLEET, parse_topic
 _MAX_ROBOTS = 64
 # A message waits this long for the rate limiter, unless a newer one replaces it.
 _NO_ROOM_S = 0.05
+# ROS 2 allows no part of a topic's name that begins so.
+_DIGIT_FIRST = re.compile(r"/\d")
 # Of all shared topics.
 _parse = functools.lru_cache(maxsize=64)(parse)
 
@@ -83,13 +86,19 @@ class Peers:
         reason = name.rejection(topic.robot, heard, now_us)
         if reason is None:
             ros_topic = name.config.topic.replace(ROBOT_IN_TOPIC, topic.robot.replace("-", "_"))
-            self._graph.advertise(ros_topic, name.config.type)
-            if self._graph.publish(ros_topic, data):
-                name.passed[topic.robot] = name.passed.get(topic.robot, 0) + 1
+            if self._graph.ros == 2 and _DIGIT_FIRST.search(ros_topic):
+                reason = "no_name_in_ros2"
             else:
-                reason = "no_ros"
+                reason = self._publish(name, topic.robot, ros_topic, data)
         if reason is not None:
             self._bridge.reject(what, reason, f"{topic.robot}: {reason.replace('_', ' ')}")
+
+    def _publish(self, name: _Heard, robot: str, topic: str, data: bytes) -> str | None:
+        self._graph.advertise(topic, name.config.type)
+        if not self._graph.publish(topic, data):
+            return "no_ros"
+        name.passed[robot] = name.passed.get(robot, 0) + 1
+        return None
 
 
 class _Shared:

@@ -3,8 +3,8 @@
 Two writers of JSON are known. People and programs write commands: those are `encode`d strictly, as nothing in
 a command may be guessed. A rosbridge server writes what a publisher sent: a `Writer` that is not ``strict``
 takes its base64 for ``uint8[]`` and its null for NaN. Both take ROS 1's and ROS 2's names for the parts of a
-time, and a header without a seq, as ROS 2 has none. A message of ROS 2 is written as little-endian CDR, and
-its bounds hold: the middleware would not publish what is beyond them.
+time, and a header without a seq, as ROS 2 has none and leaves out another's. A message of ROS 2 is written as
+little-endian CDR, and its bounds hold: the middleware would not publish what is beyond them.
 """
 
 from __future__ import annotations
@@ -122,6 +122,8 @@ class Writer:
         if kind in (TIME, DURATION):
             value = _time(value, path, strict=self._strict)
         unknown = sorted(map(str, value.keys() - {field.name for field in fields}))
+        if self._ros2 and kind == HEADER_TYPE and unknown == ["seq"]:
+            unknown = []
         if unknown:
             raise MessageError(f"{_join(path, unknown[0])}: {kind} has no such field")
         if self._ros2 and not fields:

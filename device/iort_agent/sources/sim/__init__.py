@@ -21,7 +21,7 @@ from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, Value
-from iort_contract.messages.commands import DRIVE_TYPE, MAX_LEASE_MS
+from iort_contract.messages.commands import DRIVE_TYPE, MAX_LEASE_MS, ROS2_DRIVE_TYPE
 from iort_contract.ros.definition import Definition, parse
 from iort_contract.topics import check_stream
 from iort_contract.track import Track, parse_track
@@ -97,14 +97,15 @@ class Sensors:
 
 
 _RULE = "=" * 80
-_DRIVE = parse(
-    DRIVE_TYPE,
-    f"""Header header
+_STAMPS = {DRIVE_TYPE: "uint32 seq\ntime stamp", ROS2_DRIVE_TYPE: "builtin_interfaces/Time stamp"}
+_DRIVES = {
+    kind: parse(
+        kind,
+        f"""std_msgs/Header header
 AckermannDrive drive
 {_RULE}
 MSG: std_msgs/Header
-uint32 seq
-time stamp
+{stamp}
 string frame_id
 {_RULE}
 MSG: ackermann_msgs/AckermannDrive
@@ -114,20 +115,23 @@ float32 speed
 float32 acceleration
 float32 jerk
 """,
-)
+    )
+    for kind, stamp in _STAMPS.items()
+}
 # A command without a lease has no end of its own.
 _LONGEST_S = MAX_LEASE_MS / 1000
 
 
 class SimGraph(Graph):
-    """Keeps the newest drive command, of any topic, until that topic is released. Safe to use from several
-    threads."""
+    """Keeps the newest drive command, of any topic, until that topic is released. Its type may have the form
+    of either ROS. Safe to use from several threads."""
 
     ros = 1
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._lock = threading.Lock()
+        self._types: dict[str, Definition] = {}
         self._wish: Wish | None = None
         self._topic = ""
         self._until = 0.0
@@ -138,19 +142,23 @@ class SimGraph(Graph):
             return self._wish if self._clock.monotonic() < self._until else None
 
     def definition(self, kind: str) -> Definition:
-        if kind != DRIVE_TYPE:
+        if kind not in _DRIVES:
             raise SourceError(f"a simulated car takes commands of the type {DRIVE_TYPE} only, got {kind}")
-        return _DRIVE
+        return _DRIVES[kind]
 
-    def advertise(self, topic: str, kind: str) -> None:  # noqa: ARG002 - as the graph has it
-        self.definition(kind)
+    def advertise(self, topic: str, kind: str) -> None:
+        self._types[topic] = self.definition(kind)
 
     def publish(self, topic: str, data: bytes) -> bool:
-        drive = decode(_DRIVE, data)["drive"]
-        with self._lock:
-            self._wish, self._topic = Wish(drive["speed"], drive["steering_angle"]), topic
-            self._until = self._clock.monotonic() + _LONGEST_S
+        drive = decode(self._types[topic], data)["drive"]
+        self.drive(topic, Wish(drive["speed"], drive["steering_angle"]))
         return True
+
+    def drive(self, topic: str, wish: Wish) -> None:
+        """Take a command."""
+        with self._lock:
+            self._wish, self._topic = wish, topic
+            self._until = self._clock.monotonic() + _LONGEST_S
 
     def release(self, topic: str) -> None:
         with self._lock:

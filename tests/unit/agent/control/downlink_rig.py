@@ -1,4 +1,7 @@
-"""A downlink with ROS topics in memory and a broker in the same process."""
+"""A downlink with ROS topics in memory and a broker in the same process.
+
+The topics are those of `FakeGraph.ros`; tests write types and bytes in the form of ROS 1.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,11 @@ from iort_agent.control.downlink import Downlink
 from iort_agent.control.leases import STOP_AHEAD_MS
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.ros.json_message import Writer, decode
 from iort_agent.ros.ros1_types import OnTrigger
-from iort_contract.limits import Value
+from iort_contract.limits import MessageError, Value
 from iort_contract.messages.commands import Command, encode_command
-from iort_contract.ros.definition import Definition, parse
+from iort_contract.ros.definition import Definition, layout, parse
 from testkit.agent import Loopback, ManualClock, link_of
 
 RULE = "=" * 80
@@ -49,6 +53,8 @@ TYPES = {
     "std_msgs/String": "string data",
     "geometry_msgs/PoseStamped": POSE,
 }
+# What differs in ROS 2.
+_STAMP = ("Header header\n", "std_msgs/Header header\n"), ("uint32 seq\ntime ", "builtin_interfaces/Time ")
 T0 = 1_700_000_000_000_000
 # For the agent, 0.3 s.
 LEASE_MS = 300 + STOP_AHEAD_MS
@@ -56,6 +62,30 @@ LEASE_MS = 300 + STOP_AHEAD_MS
 
 def doubles(*values: float) -> bytes:
     return struct.pack(f"<{len(values)}d", *values)
+
+
+def definition(kind: str, ros: int) -> Definition:
+    """The definition of a type in either ROS."""
+    if ros == 1:
+        return parse(kind, TYPES[kind])
+    text = TYPES[kind]
+    for old, new in _STAMP:
+        text = text.replace(old, new)
+    return parse(kind.replace("/", "/msg/"), text)
+
+
+def converted(kind: str, data: bytes, ros: int) -> bytes:
+    """The bytes of a message in a ROS, from those in the other one; malformed ones as they are."""
+    try:
+        message = decode(definition(kind, 3 - ros), data)
+    except MessageError:
+        return data
+    header = message.get("header", {})
+    if ros == 1:
+        header.setdefault("seq", 0)
+    else:
+        header.pop("seq", None)
+    return Writer(definition(kind, ros)).write(message)
 
 
 class FakeGraph:
@@ -75,15 +105,23 @@ class FakeGraph:
         self._handlers: dict[str, Callable[[Mapping[str, str], bytes], None]] = {}
 
     def definition(self, kind: str) -> Definition:
-        if kind not in TYPES:
+        short = kind.replace("/msg/", "/")
+        if short not in TYPES:
             raise SourceError(f"{kind} is not installed")
-        return parse(kind, TYPES[kind])
+        assert kind == self.form(short), "as this ROS writes it"
+        return definition(short, self.ros)
+
+    def form(self, kind: str) -> str:
+        """A type's name as this ROS writes it."""
+        return kind if self.ros == 1 else kind.replace("/", "/msg/")
 
     def advertise(self, topic: str, kind: str) -> None:
-        self.kinds[topic] = kind
+        assert self.definition(kind)
+        self.kinds[topic] = kind.replace("/msg/", "/")
 
     def publish(self, topic: str, data: bytes) -> bool:
-        assert topic in self.kinds
+        if self.ros == 2:
+            data = converted(self.kinds[topic], data, 1)
         if self.up:
             with self._news:
                 self.published.append((topic, data))
@@ -107,7 +145,10 @@ class FakeGraph:
         self._handlers[topic] = handler
 
     def hear(self, topic: str, kind: str, data: bytes) -> None:
-        self._handlers[topic]({"type": kind, "message_definition": TYPES[kind]}, data)
+        if self.ros == 2:
+            data = converted(kind, data, 2)
+        told = definition(kind, self.ros)
+        self._handlers[topic]({"type": told.kind, "message_definition": layout(told)}, data)
 
     def waits(self) -> str | None:
         return None
@@ -169,8 +210,15 @@ class Rig:
         self.settings_known = True
         self.offset: ClockOffset | None = ClockOffset(0.0, 0.0)
         where = Place(Path("car.yaml"))
+        if graph is None:
+            config = {**CONFIG, **config}
+            for name in ("cmd", "fleet"):
+                config[name] = {
+                    key: {**settings, "type": self.graph.form(settings["type"])}
+                    for key, settings in config.get(name, {}).items()
+                }
         self.downlink = Downlink(
-            load(DownlinkConfig, {**(CONFIG if graph is None else {}), **config}, where),
+            load(DownlinkConfig, config, where),
             share_rule()(share, where) if share else (),
             Bridge(link_of(self.uplink, self.clock, robot=robot), graph or self.graph, lambda: self.offset),
             boot="0badcafe",

@@ -25,6 +25,8 @@ from iort_contract.ros.definition import parse
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import LEASE_MS, T0, FakeGuard, Rig, doubles
 
+pytestmark = pytest.mark.usefixtures("ros")
+
 
 def test_a_guard_that_died_and_cannot_be_started_refuses_motion_until_it_can(
     monkeypatch: pytest.MonkeyPatch,

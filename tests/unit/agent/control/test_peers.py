@@ -41,6 +41,7 @@ from iort_contract.ros.definition import parse
 from testkit.agent import Loopback, ManualClock, link_of
 from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, T0, FakeGraph, Rig, doubles
 
+pytestmark = pytest.mark.usefixtures("ros")
 SHARE = {"/pose": {"name": "pose", "rate_hz": 5}}
 
 
@@ -88,6 +89,17 @@ def fleet(
     rig.dispatcher.run_pending()
 
 
+def test_a_pose_of_the_other_ros_passes(ros: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs = Rig(share=SHARE)
+    theirs.graph.hear("/pose", "geometry_msgs/PoseStamped", pose_bytes())
+    ((topic, payload),) = [(m.topic, m.payload) for m in theirs.uplink.published]
+    monkeypatch.setattr(FakeGraph, "ros", 3 - ros)
+    ours = Rig("car2")
+    ours.uplink.deliver(topic, payload)
+    ours.dispatcher.run_pending()
+    assert ours.graph.published == [("/fleet/car1/pose", pose_bytes())]
+
+
 def test_only_newer_messages_of_another_robot_pass() -> None:
     rig = Rig()
     for seq, boot, age_us in [(0, "0badcafe", 0), (2, "0badcafe", 0), (1, "0badcafe", 0), (0, "1badcafe", 0),
@@ -115,6 +127,15 @@ def test_a_taken_ros_name_and_too_many_robots_are_rejected() -> None:
     for i in range(64):
         fleet(rig, f"car{i}x", 0)
     assert rig.refused() == {"fleet pose name_taken_in_ros": 1, "fleet pose too_many_robots": 1}
+
+
+def test_a_name_that_ros2_does_not_allow_is_rejected(ros: int) -> None:
+    rig = Rig()
+    fleet(rig, "7", 0)
+    assert rig.refused() == ({} if ros == 1 else {"fleet pose no_name_in_ros2": 1})
+    rig = Rig(fleet={"pose": {"topic": "/fleet/car{robot}/pose", "type": "geometry_msgs/PoseStamped"}})
+    fleet(rig, "7", 0)
+    assert [topic for topic, _ in rig.graph.published] == ["/fleet/car7/pose"]
 
 
 def test_another_robots_malformed_message_is_rejected() -> None:
