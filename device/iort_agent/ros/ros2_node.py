@@ -1,22 +1,38 @@
 """The agent's node in a ROS 2 graph: one in a process, shared by all its users.
 
-One thread owns the wait set, and with it every subscription, service and event. The users of the node wait
-for nothing: they say what they want, and the thread makes it so when the graph allows.
+One thread owns the session, and with it every subscription and service. It looks at the graph several times a
+second while a wanted topic is missing, else once a second: rclpy tells of a new topic in no other way. The
+users of the node wait for none of this.
+
+Nobody tells which publisher a message is from, because rclpy leaves the publisher's GID out. So all publishers
+of one type of a topic are one to the users of the node.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
-from typing import Any, Callable
+from typing import Any, Callable, Mapping, Sequence
 
 from iort_agent.common.threads import Clock, Supervised, SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.ros import OnBytes
+from iort_agent.ros.qos import QosConfig
 from iort_agent.ros.ros1_types import OnTrigger
-from iort_agent.ros.ros2_types import rclpy
+from iort_agent.ros.ros2_session import Publisher, Session
+from iort_agent.ros.ros2_topic import OnMessage, Topic
+from iort_agent.ros.ros2_types import Types, rclpy
+from iort_agent.ros.ros2_types import service as service_class
+from iort_agent.ros.ros2_wait import RclpySession
 from iort_contract.ros.definition import Definition
 
+_log = logging.getLogger(__name__)
+
 DEFAULT_NODE = "iort_agent"
+_TRIGGER = "std_srvs/srv/Trigger"
+_LOOK_S, _MISSING_S = 1.0, 0.2
+_DEPTH = 10
+_JOIN_S = 3.0
 
 _lock = threading.Lock()
 _shared: list[Node] = []
@@ -29,7 +45,8 @@ def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:
     """
     with _lock:
         if not _shared:
-            _shared.append(Node(name, rclpy(), clock or SystemClock()))
+            rclpy()
+            _shared.append(Node(name, RclpySession, clock or SystemClock()))
         node = _shared[0]
         if node.name != name:
             raise SourceError(f"the agent is the ROS node {node.name} already, and cannot be {name} too")
@@ -42,24 +59,31 @@ class Node:
 
     ros = 2
 
-    def __init__(self, name: str, join: Callable[[str], Any], clock: Clock) -> None:
-        self.name = self.base = name
-        self._join = join
+    def __init__(self, name: str, join: Callable[[str], Session], clock: Clock) -> None:
+        self.name = name
         self.users = 0
         self.failed: str | None = None
-        self.sim_time = False
         self.ready = threading.Event()
+        # The topics in the graph.
+        self.topics: Sequence[str] = ()
         self._clock = clock
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._handlers: dict[str, list[OnBytes]] = {}
-        self._wanted: dict[str, str] = {}
+        self._session = session = join(name)
+        self.base = session.name.rpartition("/")[2]
+        self.sim_time = session.sim_time
+        self._types = Types()
+        self._wanted: dict[str, Topic] = {}
+        # How `subscribe` made an `OnMessage` of each handler.
+        self._takers: dict[tuple[str, OnBytes], OnMessage] = {}
+        self._advertised: dict[str, str] = {}
+        self._publishers: dict[str, Publisher] = {}
         self._offered: dict[str, OnTrigger] = {}
-        self._publishers: dict[str, Any] = {}
+        self._changed = True
         self._thread = Supervised("ros2 node", self._run)
 
     def start(self) -> None:
-        """Join the graph; again has no effect."""
+        """Begin; again has no effect."""
         with self._lock:
             if not self._thread.is_alive() and not self._stop.is_set():
                 self._thread.start()
@@ -70,45 +94,77 @@ class Node:
             self.users -= 1
             if self.users:
                 return
-            _shared.remove(self)
+            if self in _shared:
+                _shared.remove(self)
         self._stop.set()
-        self._thread.join(3.0)
+        self._session.wake()
+        self._thread.join(_JOIN_S)
+        if not self._thread.is_alive():
+            self._session.close()
 
     def waits(self) -> str | None:
-        """Why the graph cannot be joined. ROS 2 has no master to wait for, and allows a name twice."""
-        return None
+        """Why a topic is not heard. ROS 2 has no master to wait for, and allows a name twice."""
+        return next((topic.why for topic in [*self._wanted.values()] if topic.why is not None), None)
 
     def resolve(self, topic: str) -> str:
         """The topic's name in the graph, as the command line may remap it."""
-        return topic
+        return self._session.resolve(topic)
 
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages, of any type, in the node's thread."""
-        with self._lock:
-            self._handlers.setdefault(self.resolve(topic), []).append(handler)
+
+        def take(header: Mapping[str, str], data: bytes, _source_ns: int) -> None:
+            handler(header, data)
+
+        self._takers[topic, handler] = take
+        self.listen(topic, take)
 
     def unsubscribe(self, topic: str, handler: OnBytes) -> None:
         """Stop receiving."""
+        take = self._takers.pop((topic, handler), None)
+        if take is not None:
+            self.ignore(topic, take)
+
+    def listen(self, topic: str, taker: OnMessage, qos: QosConfig | None = None) -> None:
+        """Receive a topic's messages as `subscribe`, each with the time at which it was published; with
+        ``qos``, by that quality of service."""
+        name = self.resolve(topic)
         with self._lock:
-            handlers = self._handlers.get(self.resolve(topic), [])
-            if handler in handlers:
-                handlers.remove(handler)
+            if name not in self._wanted:
+                self._wanted[name] = Topic(name, self._session, self._types, self._clock)
+            wanted = self._wanted[name]
+            wanted.qos = qos or wanted.qos
+            wanted.takers = (*wanted.takers, taker)
+        self._change()
+
+    def ignore(self, topic: str, taker: OnMessage) -> None:
+        """Stop what `listen` began."""
+        with self._lock:
+            wanted = self._wanted.get(self.resolve(topic))
+            if wanted is not None:
+                wanted.takers = tuple(one for one in wanted.takers if one != taker)
+        self._change()
 
     def definition(self, kind: str) -> Definition:
-        """The definition of an installed type. Raises `SourceError` if it is not installed."""
-        raise SourceError(f"the ROS message type {kind} is not installed")
+        """The definition of an installed type. Raises `SourceError` if it is not installed, or cannot be
+        read."""
+        return self._types.definition(kind)
 
     def advertise(self, topic: str, kind: str) -> None:
-        """Become a publisher of the topic, reliable and volatile: an old command must not run later.
-        Raises as `definition`."""
+        """Become a publisher of the topic, to which subscribers then connect: `publish` alone is too late.
+
+        It keeps no message for subscribers that come later, because an old command must not run later.
+        """
         self.definition(kind)
         with self._lock:
-            self._wanted.setdefault(self.resolve(topic), kind)
+            self._advertised.setdefault(self.resolve(topic), kind)
+        self._change()
 
     def offer(self, service: str, handler: OnTrigger) -> None:
         """Answer calls of a service of the type std_srvs/srv/Trigger, each in a thread of its own."""
         with self._lock:
-            self._offered[self.resolve(service)] = handler
+            self._offered[service] = handler
+        self._change()
 
     def release(self, topic: str) -> None:
         """Nothing to do: a joystick or a planner on board drives on by itself."""
@@ -117,32 +173,73 @@ class Node:
         """Publish a message's CDR bytes, with their encapsulation header, on an advertised topic; False if
         the node is not in the graph."""
         publisher = self._publishers.get(self.resolve(topic))
-        if publisher is None:
+        if publisher is None or self._stop.is_set():
             return False
         publisher.publish(data)
         return True
 
     def connections(self, topic: str) -> int:
         """How many publishers a subscribed topic is connected to."""
-        return len(self._handlers.get(self.resolve(topic), ())) * 0
+        wanted = self._wanted.get(self.resolve(topic))
+        return wanted.connections() if wanted is not None else 0
 
     def listeners(self, topic: str) -> int:
         """How many subscribers an advertised topic is connected to."""
-        return len(self._wanted.get(self.resolve(topic), "")) * 0
+        publisher = self._publishers.get(self.resolve(topic))
+        return publisher.subscribers() if publisher is not None else 0
 
-    def living(self, base: str) -> frozenset[str]:  # noqa: ARG002 - as ROS 1's node
+    def living(self, base: str) -> frozenset[str]:
         """What tells the nodes of this name, in our namespace, apart: an identifier of each in the graph. One
         that was killed stays there until the middleware misses it, beside the one that was started since."""
-        return frozenset()
+        return frozenset(self._session.nodes(self._session.name[: -len(self.base)] + base))
+
+    def report(self, topic: str) -> dict[str, Any]:
+        """What was lost of a topic before it came here, and the quality of service by which it is heard."""
+        wanted = self._wanted.get(self.resolve(topic))
+        return wanted.report() if wanted is not None else {}
+
+    def _change(self) -> None:
+        self._changed = True
+        self._session.wake()
 
     # All below runs in the node's own thread.
 
     def _run(self) -> None:
+        session, look_at = self._session, 0.0
         try:
-            self._join(self.name)
-            self.ready.set()
-            self._stop.wait()
+            _log.info("ROS 2 node %s", session.name)
+            while not self._stop.is_set():
+                if self._changed or self._clock.monotonic() >= look_at:
+                    self._changed = False
+                    look_at = self._clock.monotonic() + (_LOOK_S if self._look() else _MISSING_S)
+                    self.ready.set()
+                session.wait(max(0.0, look_at - self._clock.monotonic()))
         except BaseException as error:
             if not self._stop.is_set():
-                self.failed = f"the ROS node {self.name} has ended: {type(error).__name__}: {error}"
+                self.failed = f"the ROS node {session.name} has ended: {type(error).__name__}: {error}"
                 raise
+
+    def _look(self) -> bool:
+        """Give the session what is wanted, as the graph is now. Whether every wanted topic was there."""
+        session = self._session
+        with self._lock:
+            wanted, advertised = [*self._wanted.values()], dict(self._advertised)
+            offered, self._offered = self._offered, {}
+        for topic, kind in advertised.items():
+            if topic not in self._publishers:
+                message_class = self._types.found(kind).message_class
+                self._publishers[topic] = session.advertise(topic, message_class, _DEPTH)
+        for name, handler in offered.items():
+            self._serve(name, handler)
+        session.events()
+        graph = session.topics()
+        self.topics = tuple(graph)
+        for one in wanted:
+            one.look(graph.get(one.name, ()))
+        return all(one.heard() for one in wanted)
+
+    def _serve(self, name: str, handler: OnTrigger) -> None:
+        try:
+            self._session.offer(name, service_class(_TRIGGER), handler)
+        except SourceError as error:
+            _log.error("the service %s is not offered: %s", name, error)
