@@ -44,7 +44,7 @@ def main() -> None:
         )
         spool = make_spool(config.queue, clock)
         agent = Agent(config, uplink=uplink, spool=spool, clock=clock)
-        intake = Intake("/sensors/core", TopicConfig("vesc", "header"), emit=agent.streams.emit, clock=clock)
+        intake = Intake("/sensors/core", TopicConfig("header", "vesc"), emit=agent.streams.emit, clock=clock)
         header = {"type": TYPE, "md5sum": "bench", "message_definition": topics()["/sensors/core"].definition}
         cycles = []
         for i in range(samples):

@@ -107,7 +107,15 @@ class Agent:
             drive=config.downlink.drive_limits(),
             moves=config.downlink.moves(),
         )
-        self.sources = [SourceRun(source, clock) for source in config.sources]
+        self.sources = [
+            SourceRun(
+                source,
+                clock,
+                queue=config.queue.path,
+                taken=[name for other in config.sources if other is not source for name in other.streams()],
+            )
+            for source in config.sources
+        ]
         # Folders and questions share it: the broker's answers have one handler.
         uploader = None
         if config.files.folder or config.files.large_folder or config.downlink.ask:

@@ -147,4 +147,4 @@ def test_use_sim_time_is_detected_while_running(cars: Cars) -> None:
     cars.publisher("pub")
     until_turns(collector, 5)
     cars.graph.parameter("/use_sim_time", True)
-    collector.until_said("/use_sim_time")
+    collector.until_said("use_sim_time")

@@ -79,6 +79,10 @@ LOST = frozenset(
         "unread",
         "bad_cells",
         "type_unknown",
+        "lost_by_middleware",
+        "incompatible_qos",
+        "refused_by_middleware",
+        "type_not_installed",
         "not_a_number",
         "others",
     }

@@ -36,7 +36,7 @@ from iort_agent.common.schema import (
     text,
 )
 from iort_agent.errors import AskError
-from iort_agent.sources.ros1 import Ros1Config, ros_name
+from iort_agent.sources.ros import RosConfig, ros_name
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
 from iort_contract.messages.commands import (
@@ -206,7 +206,7 @@ class DownlinkConfig:
     def graph(self, sources: Iterable[object]) -> RosGraph:
         """The graph that everything here and in `share` is for: the one of the sources. The types decide if
         these are of both kinds, or of none. Raises `ContractError` for a type of the other ROS."""
-        nodes = {1: one.node for one in sources if isinstance(one, Ros1Config)}  # noqa: B035 - one ROS so far
+        nodes = {one.ros: one.node for one in sources if isinstance(one, RosConfig)}
         types = {
             f"{section}.{name}.type": settings.type
             for section, entries in (("cmd", self.cmd), ("fleet", self.fleet))

@@ -77,6 +77,8 @@ class Node:
         self.failed: str | None = None
         self.sim_time = False
         self.ready = threading.Event()
+        # The topics that have publishers, by the last poll.
+        self.topics: Sequence[str] = ()
         self._waits: str | None = None
         self._rospy = rospy
         self._clock = clock
@@ -242,7 +244,8 @@ class Node:
                     return
                 self._change()
                 self.ready.set()
-                if not self._clock.wait(self._wake, _POLL_S):
+                # The first time at once: a topic may be wanted by a pattern.
+                if not self._clock.wait(self._wake, _POLL_S if self.topics else _WAIT_S):
                     self._poll()
         except Exception:
             if not self._displaced:
@@ -382,6 +385,7 @@ class Node:
             if self._absent:
                 _log.info("the ROS master at %s answers again", self._uri)
             self._absent = False
+            self.topics = tuple(topic for topic, _ in publishers)
             if uri and uri != self._rospy.get_node_uri() and self._answers(uri):
                 # To register again would end the other one.
                 self._displaced = True

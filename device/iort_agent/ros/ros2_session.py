@@ -67,8 +67,8 @@ class Session(Protocol):
     def count(self, topic: str) -> int:
         """How many publishers a topic has; cheaper than `publishers`."""
 
-    def nodes(self) -> Sequence[str]:
-        """The full names of the graph's nodes."""
+    def nodes(self, name: str) -> Sequence[str]:
+        """An identifier of each node of a full name."""
 
     def subscribe(
         self, topic: str, message_class: Any, request: Request, take: Take, told: Told

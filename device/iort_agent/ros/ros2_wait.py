@@ -71,8 +71,10 @@ class RclpySession:
     def count(self, topic: str) -> int:
         return int(self.node.count_publishers(topic))
 
-    def nodes(self) -> Sequence[str]:
-        return [f"{space.rstrip('/')}/{name}" for name, space in self.node.get_node_names_and_namespaces()]
+    def nodes(self, name: str) -> Sequence[str]:
+        # Each node has a publisher of this topic.
+        infos = self.node.get_publishers_info_by_topic("/parameter_events")
+        return [bytes(info.endpoint_gid).hex() for info in infos if _endpoint(info).node == name]
 
     def subscribe(
         self, topic: str, message_class: Any, request: Request, take: Take, told: Told

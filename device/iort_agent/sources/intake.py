@@ -1,4 +1,4 @@
-"""One ROS topic's messages, from their bytes to samples, wherever the bytes come from.
+"""One ROS topic's messages, of ROS 1 or 2, from their bytes to samples, wherever the bytes come from.
 
 Messages are recorded as published, so that an export gives what was published, whatever the type is. Only
 selected fields are decoded here. This module needs no ROS.
@@ -18,6 +18,7 @@ from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
 from iort_agent.ros.ros1_types import installed
 from iort_agent.sources import REFUSE, UPLOAD, Emit
+from iort_agent.sources.repeats import Latched
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.ros.decode import Decoder, Large, stamp_ns
@@ -27,12 +28,14 @@ from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)
 
-HEADER, ARRIVAL = "header", "arrival"
+HEADER, ARRIVAL, SOURCE = "header", "arrival", "source"
 # A stamp further from the wall clock comes from a clock that is not set, or from a simulation.
 BELIEVABLE_US = 3600 * 1_000_000
 _SILENT_S = 5.0
 # Messages that wait together, at most: the one that the live lane sends waits for those before it.
 _TOGETHER = 16
+# A message of this size costs so much that waiting for others saves nothing, and takes their memory.
+_LARGE_BYTES = 65_536
 # A topic changes its definition when somebody rebuilds a package, not all the time.
 _MAX_KINDS = 32
 _MAX_PUBLISHERS = 32
@@ -46,12 +49,12 @@ class TopicConfig:
 
     ``time`` is required: ``header`` is the time of the measurement, by the clock of the computer that
     measured; ``arrival`` is the time of receipt, by the agent's clock. A message that a latching publisher
-    repeats to a new connection is left out in both cases, and counted as ``latched_again``. ``fields`` are
+    repeats to a new connection is left out in all cases, and counted as ``latched_again``. ``fields`` are
     the wanted paths, or their beginnings (``pose.position``); without it, all.
     """
 
-    stream: str = setting(text(check_stream))
     time: str = setting(choice(HEADER, ARRIVAL))
+    stream: str = setting(text(check_stream))
     fields: tuple[str, ...] | None = setting(
         items(text(), at_least=1, what="a list of at least one field"), default=None
     )
@@ -65,13 +68,21 @@ class Kind(NamedTuple):
     text: str
     decoder: Optional[Decoder]  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
     stamped: bool
+    ros2: bool
 
 
 class Intake:
     """Takes one topic's messages. Safe to use from several threads."""
 
     def __init__(
-        self, topic: str, config: TopicConfig, *, emit: Emit, clock: Clock, large: str = REFUSE
+        self,
+        topic: str,
+        config: TopicConfig,
+        *,
+        emit: Emit,
+        clock: Clock,
+        large: str = REFUSE,
+        latched: Latched | None = None,
     ) -> None:
         self.sim_time = False
         self.throttled = ThrottledLog(_log, clock)
@@ -86,44 +97,52 @@ class Intake:
         self._kind: Kind | None = None
         self._kinds: dict[tuple[str, str], Kind] = {}
         self._decoders: list[Decoder] = []
-        # Publisher -> its connection, and the last message that came by it.
-        self._latched: dict[str, tuple[Mapping[str, str], bytes]] = {}
+        self._latched = latched or Latched({})
+        # Publisher -> the connection by which its last latched message came.
+        self._latching: dict[str, Mapping[str, str]] = {}
         self._lock = threading.Lock()
         # What `receive` has got, and until when it may stay there.
-        self._inbox: deque[tuple[Mapping[str, str], bytes, int]] = deque()
+        self._inbox: deque[tuple[Mapping[str, str], bytes, int, int]] = deque()
         self._inbox_lock = threading.Lock()
         self._due = 0.0
         self._messages = self._seen = 0
         self._heard = clock.monotonic()
         self._silent = False
 
-    def receive(self, header: Mapping[str, str], data: bytes) -> None:
-        """Note a message that arrives now. It is taken with those before it, when the live lane wants one:
+    def receive(self, header: Mapping[str, str], data: bytes, source_ns: int = 0) -> None:
+        """Note a message that arrives now; ``source_ns`` is when the middleware says it was published. It is
+        taken with those before it, when the live lane wants one:
         the first one after a pause costs as much as ten that follow it at once. Of a topic that falls silent,
         `look` takes them. Never raises."""
-        self._inbox.append((header, data, self._clock.now_us()))
-        if len(self._inbox) >= _TOGETHER or self._clock.monotonic() >= self._due:
+        self._inbox.append((header, data, self._clock.now_us(), source_ns))
+        if len(self._inbox) >= _TOGETHER or self._clock.monotonic() >= self._due or len(data) > _LARGE_BYTES:
             self.take_received()
 
     def take_received(self) -> None:
         """Take what `receive` has got."""
         with self._inbox_lock:
             while self._inbox:
-                header, data, arrival_us = self._inbox.popleft()
+                header, data, arrival_us, source_ns = self._inbox.popleft()
                 try:
-                    self.take(header, data, arrival_us, more=bool(self._inbox))
+                    self.take(header, data, arrival_us, source_ns, more=bool(self._inbox))
                 except Exception:  # noqa: BLE001 - whatever it is, the others must be heard
                     # A failing disk or a full memory costs this message, and neither the topic nor others.
                     _log.exception("topic %s: a message could not be taken", self._topic)
 
     def take(
-        self, header: Mapping[str, str], data: bytes, arrival_us: int | None = None, *, more: bool = False
+        self,
+        header: Mapping[str, str],
+        data: bytes,
+        arrival_us: int | None = None,
+        source_ns: int = 0,
+        *,
+        more: bool = False,
     ) -> None:
         """Take a message with the header of its connection; ``arrival_us`` is now unless given, and ``more``
         tells that others follow at once. Never raises."""
         if arrival_us is None:
             arrival_us = self._clock.now_us()
-        if header.get("latching") == "1" and self._came_before(header, data):
+        if header.get("latching") == "1" and self._came_before(header, data, source_ns):
             self.warn("latched_again", "a latched message came again; not sent")
             return
         self._messages += 1
@@ -134,13 +153,16 @@ class Intake:
             kind = self._kind
         assert kind is not None
         t_us = None
-        if kind.stamped and self._config.time == HEADER:
-            t_ns = stamp_ns(data)
+        time = self._config.time
+        if time == SOURCE:
+            t_us = source_ns // 1000 or None
+        elif kind.stamped and time == HEADER:
+            t_ns = stamp_ns(data, ros2=kind.ros2)
             t_us = None if t_ns is None else t_ns // 1000
         whole = kind.whole if kind.decoder is None else None
         values = RosMessage(data, whole) if whole is not None else self._sample(kind, data)
         if t_us is None or self.sim_time or not -BELIEVABLE_US < t_us - arrival_us < BELIEVABLE_US:
-            if self._config.time == HEADER:
+            if time != ARRIVAL:
                 self._warn_of_stamp(t_us, arrival_us)
             t_us = arrival_us
         if values is not None:
@@ -204,16 +226,19 @@ class Intake:
             return None
         return values
 
-    def _came_before(self, header: Mapping[str, str], data: bytes) -> bool:
+    def _came_before(self, header: Mapping[str, str], data: bytes, source_ns: int) -> bool:
         """Whether a latching publisher repeats the message to a new connection: old data, whatever its
         time."""
         publisher = header.get("callerid", "")
         with self._lock:
-            connection, last = self._latched.get(publisher, (header, b""))
-            if publisher not in self._latched and len(self._latched) >= _MAX_PUBLISHERS:
-                self._latched.clear()
-            self._latched[publisher] = header, data
-        return connection is not header and last == data
+            if source_ns:
+                return self._latched.came_before(str(source_ns), data)
+            again = self._latched.came_before(publisher, data)
+            connection = self._latching.get(publisher)
+            if connection is None and len(self._latching) >= _MAX_PUBLISHERS:
+                self._latching.clear()
+            self._latching[publisher] = header
+        return again and connection is not header
 
     def _turn_to(self, header: Mapping[str, str], t_us: int) -> None:
         """Take the messages of another connection, which may be a new one."""
@@ -243,11 +268,11 @@ class Intake:
         return self._kinds[key]
 
     def _make_kind(self, kind: str, md5sum: str, text: str) -> Kind:
-        decoder, stamped, why = None, False, ""
+        decoder, stamped, why, ros2 = None, False, "", "/msg/" in kind
         _log.info("topic %s: %s, %s", self._topic, kind, md5sum)
         try:
             # Some small clients send no definition; then only the installed class has it.
-            if not text.strip() and md5sum != _MD5_OF_NOTHING:
+            if not text.strip() and md5sum != _MD5_OF_NOTHING and not ros2:
                 text = installed(kind).text
             definition = parse(kind, text)
             stamped = definition.stamped()
@@ -260,13 +285,13 @@ class Intake:
             self.warn(
                 "undecodable", f"its messages are kept, but cannot be looked into: {why or whole.error}"
             )
-        return Kind(whole, text, decoder, stamped)
+        return Kind(whole, text, decoder, stamped, ros2)
 
     def _warn_of_stamp(self, t_us: int | None, arrival_us: int) -> None:
         if t_us is None:
-            reason, why = "no_stamp", "its messages have no header, so they have no time"
+            reason, why = "no_stamp", "its messages have no time of their own"
         elif self.sim_time:
-            reason, why = "unbelieved_stamps", "its time is a simulation's (/use_sim_time)"
+            reason, why = "unbelieved_stamps", "its time is a simulation's (use_sim_time)"
         else:
             off_s = (t_us - arrival_us) / 1e6
             reason, why = "unbelieved_stamps", f"its stamps are {off_s:.0f} s off the clock"

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
+from pathlib import Path
 from typing import Any, Mapping, Sequence
 
 from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
 from iort_agent.sources import Emit, SourceConfig
 from iort_agent.sources.recording import BagConfig
+from iort_agent.sources.ros import RosSource
 from iort_agent.sources.ros1 import Ros1Config
+from iort_agent.sources.ros2 import Ros2Config
 from iort_agent.sources.rosbridge import RosbridgeConfig
 from iort_agent.sources.sim import SimConfig
 from iort_agent.sources.vesc import VescConfig
@@ -18,6 +21,7 @@ from iort_agent.sources.vesc import VescConfig
 SOURCES: Mapping[str, type[SourceConfig]] = {
     "bag": BagConfig,
     "ros1": Ros1Config,
+    "ros2": Ros2Config,
     "rosbridge": RosbridgeConfig,
     "sim": SimConfig,
     "vesc": VescConfig,
@@ -30,10 +34,16 @@ _log = logging.getLogger(__name__)
 class SourceRun:
     """Builds the source of a configuration and runs it once."""
 
-    def __init__(self, config: SourceConfig, clock: Clock) -> None:
+    def __init__(
+        self, config: SourceConfig, clock: Clock, *, queue: Path | None = None, taken: Sequence[str] = ()
+    ) -> None:
+        """``queue`` is the file beside which a source may keep what it must know after a restart; ``taken``
+        are the streams of the other sources."""
         self.description, self.streams = config.describe(), config.streams()
         self.recorded, self.replayed = config.recorded(), config.replayed()
         self.source = config.build(clock)
+        if isinstance(self.source, RosSource):
+            self.source.remember(queue, taken)
         self.failed = False
         self._ended = False
 

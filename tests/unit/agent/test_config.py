@@ -146,7 +146,10 @@ STOP, CRAWL = "motion: {stop: {}}", "motion: {stop: {drive: {speed: 0.1}}}"
         ((SIM, ""), "sources: must be ... got nothing ... at least one source"),
         ((SIM, "  []\n"), "sources: must be ... got [] (a list) ... at least one source"),
         ((SIM, "  - sim\n"), "sources[0]: must be ... got 'sim' ... a mapping with the key type"),
-        ((SIM, "  - {}\n"), "sources[0].type: must be ... got nothing ... bag, ros1, rosbridge, sim, vesc"),
+        (
+            (SIM, "  - {}\n"),
+            "sources[0].type: must be ... got nothing ... bag, ros1, ros2, rosbridge, sim, vesc",
+        ),
         ((SIM, "  - {type: sum}\n"), "sources[0].type: ... got 'sum' ... bag, ros1 ... did you mean sim?"),
         ((SIM, SIM + "    rate_hz: fast\n"), "sources[0].rate_hz: ... got 'fast' ... 0.1 to 2000 (Hz)"),
         ((SIM, SIM + "    rate_hz: .nan\n"), "sources[0].rate_hz: must be ... got nan ... 0.1 to 2000"),

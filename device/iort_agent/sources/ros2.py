@@ -1,0 +1,91 @@
+"""A node in a ROS 2 graph: any topic, of any message type that is installed, by the robot's own rclpy.
+
+Messages are recorded in the bytes in which they were published. The environment's ROS_DOMAIN_ID and
+RMW_IMPLEMENTATION are rclpy's affair.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from typing import Any, Iterator, Mapping
+
+from iort_agent.common.schema import choice, section, setting, text
+from iort_agent.common.threads import Clock
+from iort_agent.errors import SourceError
+from iort_agent.ros.qos import QosConfig
+from iort_agent.ros.ros2_node import DEFAULT_NODE, shared
+from iort_agent.ros.ros2_types import rclpy
+from iort_agent.sources import FAIL, OK, Finding, ros
+from iort_agent.sources.intake import ARRIVAL, HEADER, SOURCE, Intake
+from iort_agent.sources.ros import RosConfig, RosSource, node_name, topics_rule
+
+# What chooses the part of the network in which robots find each other: until Humble, and since Iron.
+_RANGES = ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE")
+
+
+@dataclass(frozen=True)
+class TopicConfig(ros.TopicConfig):
+    """How a topic is recorded, as of ROS 1. The ``time`` may also be ``source``, at which the middleware
+    published the message, by the publisher's clock. ``qos`` is chosen by what the publishers offer, unless
+    it is given here."""
+
+    time: str = setting(choice(HEADER, ARRIVAL, SOURCE))
+    qos: QosConfig = setting(section(QosConfig), QosConfig())
+
+
+@dataclass(frozen=True)
+class Ros2Config(RosConfig):
+    """Topics of the ROS 2 graph that the environment's ROS_DOMAIN_ID names. A name with ``*``, which stands
+    for any characters, is a pattern of topics."""
+
+    ros = 2
+
+    topics: tuple[tuple[str, TopicConfig], ...] = setting(topics_rule(TopicConfig))
+    node: str = setting(text(node_name), DEFAULT_NODE)
+
+    def describe(self) -> str:
+        """The source in a few words."""
+        return f"ROS 2 topics {self.listed()}"
+
+    def build(self, clock: Clock) -> Ros2Source:
+        """Make the source; rclpy is looked for when it runs."""
+        return Ros2Source(self, clock)
+
+    def check(self, title: str) -> Iterator[Finding]:
+        """Whether rclpy is there, and which graph it would join."""
+        python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
+        try:
+            middleware = rclpy().get_rmw_implementation_identifier()
+        except SourceError as error:
+            todo = (
+                "source /opt/ros/<distribution>/setup.bash, in an environment of that distribution's Python"
+            )
+            yield Finding(title, FAIL, f"{python} finds no rclpy: {error}", todo)
+            return
+        except Exception as error:  # noqa: BLE001 - a middleware that is not installed, for example
+            yield Finding(title, FAIL, f"rclpy: {error}", "see RMW_IMPLEMENTATION")
+            return
+        distribution = os.environ.get("ROS_DISTRO", "of no name")
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        ranges = [f"{name}={os.environ[name]}" for name in _RANGES if os.environ.get(name)]
+        found = [f"ROS 2 {distribution}", python, str(middleware), f"domain {domain}", *ranges]
+        yield Finding(title, OK, ", ".join(found))
+
+
+class Ros2Source(RosSource):
+    """The source of ROS 2."""
+
+    def join(self) -> Any:
+        return shared(self._config.node, self._clock)
+
+    def listen(self, topic: str, settings: TopicConfig, intake: Intake) -> None:
+        self._node.listen(topic, intake.receive, settings.qos)
+
+    def ignore(self, topic: str, intake: Intake) -> None:
+        self._node.ignore(topic, intake.receive)
+
+    def counts(self, topic: str) -> Mapping[str, Any]:
+        counts: Mapping[str, Any] = self._node.report(topic)
+        return counts
