@@ -31,6 +31,8 @@ _log = logging.getLogger(__name__)
 DEFAULT_NODE = "iort_agent"
 _TRIGGER = "std_srvs/srv/Trigger"
 _LOOK_S, _MISSING_S = 1.0, 0.2
+# To ask what a topic's publishers offer takes a while; that of so many topics is asked for at a look.
+_AT_A_LOOK = 10
 _DEPTH = 10
 _JOIN_S = 3.0
 
@@ -57,9 +59,15 @@ def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:
 class Node:
     """Use `shared`. Subscriptions and publishers may be requested before anybody else is in the graph."""
 
+<<<<<<< HEAD
     ros = 2
 
     def __init__(self, name: str, join: Callable[[str], Session], clock: Clock) -> None:
+=======
+    def __init__(
+        self, name: str, join: Callable[[str], Session], clock: Clock, types: Types | None = None
+    ) -> None:
+>>>>>>> 0e75b129 (tests: hold the node of a ROS 2 graph without ROS)
         self.name = name
         self.users = 0
         self.failed: str | None = None
@@ -72,7 +80,7 @@ class Node:
         self._session = session = join(name)
         self.base = session.name.rpartition("/")[2]
         self.sim_time = session.sim_time
-        self._types = Types()
+        self._types = types or Types()
         self._wanted: dict[str, Topic] = {}
         # How `subscribe` made an `OnMessage` of each handler.
         self._takers: dict[tuple[str, OnBytes], OnMessage] = {}
@@ -234,8 +242,9 @@ class Node:
         session.events()
         graph = session.topics()
         self.topics = tuple(graph)
+        every = 1 + len(wanted) // _AT_A_LOOK
         for one in wanted:
-            one.look(graph.get(one.name, ()))
+            one.look(graph.get(one.name, ()), every)
         return all(one.heard() for one in wanted)
 
     def _serve(self, name: str, handler: OnTrigger) -> None:

@@ -26,8 +26,6 @@ from iort_contract.ros.definition import VARIABLE, Definition
 
 _log = logging.getLogger(__name__)
 
-# The publishers' number is asked for at each look, and all that they offer after so many looks.
-_LOOKS = 5
 # A better quality of service is requested once it was offered at so many looks: publishers come and go.
 _STEADY = 5
 # The next subscription has so many looks to connect.
@@ -99,17 +97,18 @@ class Topic:
         qos = "; ".join(sorted({str(part.asked.offer) for part in [*self._parts.values()]}))
         return {**self._counts, **({"qos": qos} if qos else {})}
 
-    def look(self, kinds: Sequence[str]) -> None:
-        """Subscribe to each type that the topic has now, by what its publishers offer."""
+    def look(self, kinds: Sequence[str], every: int = 1) -> None:
+        """Subscribe to each type that the topic has now, by what its publishers offer. That is asked for at
+        each of so many looks, and when the types or the number of publishers have changed."""
         if not self.takers:
             for kind in [*self._parts]:
                 self._parts.pop(kind).close()
             self._seen, self.why = ((), 0), None
             return
         seen = tuple(kinds), self._session.count(self.name) if kinds else 0
-        self._looks += 1
         settled = all(part.settled() for part in self._parts.values()) and not self._incompatible
-        if seen == self._seen and self._looks < _LOOKS and settled:
+        self._looks += 1
+        if seen == self._seen and self._looks < every and settled:
             return
         self._seen, self._looks = seen, 0
         offers: dict[str, list[Endpoint]] = {}
@@ -204,17 +203,18 @@ class Topic:
     ) -> dict[str, str]:
         """What a ROS 1 publisher's connection header has. A definition that does not fit the publisher's type
         hash is left out."""
+        fitting = {"message_definition": text}
         hashes = {one.type_hash for one in endpoints if one.type_hash} or {type_hash}
         if type_hash not in hashes and type_hash.startswith("RIHS"):
             other = min(hashes)
             if part.header.get("md5sum") != other:
                 why = f"its publisher's definition of {part.kind} ({other}) is not the installed one"
                 self._count(_DIFFERS, 1, f"{why} ({type_hash}): source the publisher's workspace")
-            text, type_hash = "", other
+            fitting, type_hash = {}, other
         return {
             "type": part.kind,
             "md5sum": type_hash,
-            "message_definition": text,
+            **fitting,
             "callerid": endpoints[0].node if len(endpoints) == 1 else "",
             "latching": "1" if part.asked.offer.transient_local else "0",
         }

@@ -259,21 +259,23 @@ class Intake:
 
     def _kind_of(self, header: Mapping[str, str]) -> Kind:
         key = (header.get("type", ""), header.get("md5sum", ""))
-        known, text = self._kinds.get(key), header.get("message_definition", "")
+        known, text = self._kinds.get(key), header.get("message_definition")
         # One of two publishers may have sent no definition, and the other sends it.
-        if known is None or key[1] == "*" or (not known.text.strip() and text.strip()):
+        if known is None or key[1] == "*" or (not known.text.strip() and text and text.strip()):
             if len(self._kinds) >= _MAX_KINDS:
                 self._kinds.clear()
             self._kinds[key] = self._make_kind(*key, text)
         return self._kinds[key]
 
-    def _make_kind(self, kind: str, md5sum: str, text: str) -> Kind:
-        decoder, stamped, why, ros2 = None, False, "", "/msg/" in kind
+    def _make_kind(self, kind: str, md5sum: str, sent: str | None) -> Kind:
+        decoder, stamped, why, ros2, text = None, False, "", "/msg/" in kind, sent or ""
         _log.info("topic %s: %s, %s", self._topic, kind, md5sum)
         try:
             # Some small clients send no definition; then only the installed class has it.
             if not text.strip() and md5sum != _MD5_OF_NOTHING and not ros2:
                 text = installed(kind).text
+            if sent is None and ros2:
+                raise MessageError(f"the definition of {kind}, {md5sum}, is not installed")  # noqa: TRY301 - one way out
             definition = parse(kind, text)
             stamped = definition.stamped()
             if self._config.fields or self._large:

@@ -18,7 +18,17 @@ import pytest
 import iort_agent
 from iort_agent.agent import Agent, make_status
 from iort_agent.common.schema import Place, load
-from iort_agent.common.threads import END, FIRST_S, RESTART, THREADS, WATCH, Kind, Supervised, Watch
+from iort_agent.common.threads import (
+    END,
+    FIRST_S,
+    RESTART,
+    THREADS,
+    WATCH,
+    Kind,
+    Supervised,
+    SystemClock,
+    Watch,
+)
 from iort_agent.config import Config
 from iort_agent.control.config import DownlinkConfig
 from iort_agent.errors import AgentError
@@ -38,6 +48,7 @@ from testkit.agent import Loopback, ManualClock, Published
 from tests.unit.agent.control import test_guard
 from tests.unit.agent.control.downlink_rig import FakeGraph
 from tests.unit.agent.control.test_peers import ANSWERS, NAME, TOPIC, AskingRig, string
+from tests.unit.agent.ros2_graph import FakeGraph as Ros2Graph
 from tests.unit.agent.test_agent import DOWNLINK
 from tests.unit.agent.test_identity import made, text
 
@@ -186,12 +197,14 @@ def ros2_node(kind: str, _folder: Path, _patch: pytest.MonkeyPatch) -> None:
     """The process ends."""
     ended = threading.Event()
     WATCH.on_end(ended.set)
-    node = ros2_module.Node("iort_agent", lambda _: surprise(), Trap("nobody"))
+    graph = Ros2Graph()
+    graph.fails = Surprise("of a kind that nobody handles")
+    node = ros2_module.Node("iort_agent", graph.join, SystemClock())
     node.users = 1
     node.start()
     assert ended.wait(SOON_S)
     assert "so the agent ends" in alarms(kind)[0]
-    assert node.failed == f"the ROS node iort_agent has ended: {WHY}"
+    assert node.failed == f"the ROS node /iort_agent has ended: {WHY}"
     node._thread.join(SOON_S)
 
 
