@@ -59,15 +59,11 @@ def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:
 class Node:
     """Use `shared`. Subscriptions and publishers may be requested before anybody else is in the graph."""
 
-<<<<<<< HEAD
     ros = 2
 
-    def __init__(self, name: str, join: Callable[[str], Session], clock: Clock) -> None:
-=======
     def __init__(
         self, name: str, join: Callable[[str], Session], clock: Clock, types: Types | None = None
     ) -> None:
->>>>>>> 0e75b129 (tests: hold the node of a ROS 2 graph without ROS)
         self.name = name
         self.users = 0
         self.failed: str | None = None
