@@ -1,5 +1,6 @@
 // Reads a recording with the libraries that Foxglove reads it with, and prints it, one JSON value a line:
-// a channel {topic, type, md5sum}, or a message {topic, t_ns, message}. Numbers beyond a double are texts.
+// a channel {topic, type, md5sum}, or a message {topic, t_ns, message}. Numbers beyond a double are texts. The
+// md5sum of a type of ROS 2 is its hash.
 // node foxglove_reader.cjs <node_modules> <file.mcap or file.bag>
 const { createRequire } = require("node:module");
 const { open, readFile } = require("node:fs/promises");
@@ -9,6 +10,7 @@ const [modules, path] = process.argv.slice(2);
 const from = createRequire(join(resolve(modules), "x.js"));
 const { parse } = from("@foxglove/rosmsg");
 const { MessageReader } = from("@foxglove/rosmsg-serialization");
+const { MessageReader: MessageReader2 } = from("@foxglove/rosmsg2-serialization");
 
 function plain(_, value) {
   if (typeof value === "bigint") return value.toString();
@@ -18,8 +20,8 @@ function plain(_, value) {
 const print = (value) => process.stdout.write(`${JSON.stringify(value, plain)}\n`);
 
 // What Foxglove does with a channel: parse the definition, compile a reader of it.
-function reader(definition) {
-  return new MessageReader(parse(definition));
+function reader(definition, ros2 = false) {
+  return ros2 ? new MessageReader2(parse(definition, { ros2 })) : new MessageReader(parse(definition));
 }
 
 async function mcap() {
@@ -41,11 +43,13 @@ async function mcap() {
   const readers = new Map();
   for (const [id, channel] of indexed.channelsById) {
     const schema = indexed.schemasById.get(channel.schemaId);
-    if (channel.messageEncoding !== "ros1" || schema.encoding !== "ros1msg") {
+    const ros2 = channel.messageEncoding === "cdr";
+    if (schema.encoding !== (ros2 ? "ros2msg" : "ros1msg") || !(ros2 || channel.messageEncoding === "ros1")) {
       throw new Error(`${channel.topic}: ${channel.messageEncoding} of ${schema.encoding}`);
     }
-    readers.set(id, reader(new TextDecoder().decode(schema.data)));
-    print({ topic: channel.topic, type: schema.name, md5sum: channel.metadata.get("md5sum") });
+    readers.set(id, reader(new TextDecoder().decode(schema.data), ros2));
+    const md5sum = channel.metadata.get(ros2 ? "topic_type_hash" : "md5sum");
+    print({ topic: channel.topic, type: schema.name, md5sum });
   }
   for await (const { channelId, logTime, data } of indexed.readMessages()) {
     const { topic } = indexed.channelsById.get(channelId);

@@ -171,8 +171,9 @@ def blocks(samples: Sequence[Mapping[str, Value]]) -> list[Block]:
     ]
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+@pytest.mark.parametrize("suffix", [".mcap", ".bag", "2.mcap"])
 def test_foxglove_reads_every_message_of_every_type(tmp_path: Path, suffix: str) -> None:
+    ros2 = suffix == "2.mcap"
     stamped = [{"x": i / 7, "code": i} for i in range(COUNT)]
     rich = [{**RICH_SAMPLE, "large": 2**53 + i, "parts.1.x": i / 3, "name": f"ü{i}"} for i in range(COUNT)]
     untyped = [{"rule_ms": None if i % 3 == 0 else i / 9, "pose.x": i} for i in range(COUNT)]
@@ -182,25 +183,27 @@ def test_foxglove_reads_every_message_of_every_type(tmp_path: Path, suffix: str)
         "/rich": Maker(MessageType("rich", "/rich", "a_msgs/A", "", RICH), list(rich[0])),
         "/rtt": Maker(own, list(untyped[0]), own=True),
     }
-    path, md5sums = tmp_path / f"ride{suffix}", {}
-    with bags.KINDS[suffix](path) as file:
+    path, kinds = tmp_path / f"ride{suffix}", {}
+    with bags.mcap(path, ros2=True) if ros2 else bags.KINDS[suffix](path) as file:
         for maker, samples in zip(makers.values(), (stamped, rich, untyped), strict=True):
             write, form = file.topic(maker.kind)
-            md5sums[maker.kind.topic] = form.md5sum
+            kinds[maker.kind.topic] = form.kind, form.md5sum
+            assert form.ros2 == ros2
             for block in blocks(samples):
                 for t_ns, message in maker.messages(block):
                     write(t_ns, message)
 
     found = opened(path)
-    assert found.types == {topic: (maker.kind.kind, md5sums[topic]) for topic, maker in makers.items()}
+    assert found.types == kinds
     times = [(T_US + 1000 * i) * 1000 for i in range(COUNT)]
     for topic in makers:
         assert [t_ns for t_ns, _ in found.messages[topic]] == times
     messages = {topic: [message for _, message in found.messages[topic]] for topic in makers}
     assert [message["b"] for message in messages["/stamped"]] == stamped
     headers = [message["header"] for message in messages["/stamped"]]
-    assert [header["seq"] for header in headers] == list(range(COUNT))
-    assert [header["stamp"]["sec"] * 10**9 + header["stamp"]["nsec"] for header in headers] == times
+    assert [header.get("seq") for header in headers] == ([None] * COUNT if ros2 else list(range(COUNT)))
+    part = "nanosec" if ros2 else "nsec"
+    assert [header["stamp"]["sec"] * 10**9 + header["stamp"][part] for header in headers] == times
     assert {header["frame_id"] for header in headers} == {""}
     # JavaScript's 64-bit integers are printed as texts.
     assert [flat(message) for message in messages["/rich"]] == [
