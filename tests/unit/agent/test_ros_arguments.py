@@ -8,7 +8,7 @@ import pytest
 
 from iort_agent import cli
 from iort_agent.errors import ConfigError
-from iort_agent.ros.arguments import Split, split
+from iort_agent.ros.arguments import Split, for_another, split
 
 ROS2 = ["--ros-args", "-r", "__node:=recorder", "-r", "/a:=/b", "-p", "config:=car.yaml", "--"]
 
