@@ -116,6 +116,23 @@ def command_line() -> argparse.ArgumentParser:
     claiming.add_argument("--robot", metavar="NAME", help="the robot's name, instead of the claim's")
     renewing = command("renew", renew, "replace the robot's key and certificate, with a new claim")
     renewing.add_argument("--claim", type=Path, required=True, metavar="FILE", help="the claim's YAML file")
+    text = "look at the robot's ROS topics and VESCs, and write `sources` of car.yaml; overwrites nothing"
+    starting = commands.add_parser("init", help=text, description=text[0].upper() + text[1:] + ".")
+    starting.set_defaults(command=init)
+    starting.add_argument(
+        "--out",
+        type=Path,
+        default=Path("car.yaml"),
+        metavar="FILE",
+        help="the file to write (default: car.yaml); if it exists, FILE.new.yaml is, with its other sections",
+    )
+    starting.add_argument("--all", action="store_true", help="also what is left out otherwise")
+    starting.add_argument(
+        "--topic", nargs="+", default=[], metavar="NAME", help="these topics alone; /sensors/* is possible"
+    )
+    starting.add_argument(
+        "--listen-s", type=_seconds, default=5.0, metavar="S", help="how long to listen (default: 5)"
+    )
     return parser
 
 
@@ -254,6 +271,19 @@ def renew(options: argparse.Namespace) -> int:
     config = load_config(options.config)
     provision.renew(options.config, options.claim, status_socket=_socket(options, config))
     print(f"{config.robot} has a new certificate; the operator should revoke the one before")
+    return 0
+
+
+def init(options: argparse.Namespace) -> int:
+    """`iort-agent init`."""
+    from iort_agent.verbs.init import init as write  # noqa: PLC0415 - as above
+
+    written = write(options.out, every=options.all, wanted=options.topic, listen_s=options.listen_s)
+    print(f"written: {written}")
+    if written == options.out:
+        print("next: put it into the car.yaml of the robot's bundle, or `iort-agent init --out` that file")
+    else:
+        print(f"next: mv {written} {options.out} && iort-agent check --config {options.out}")
     return 0
 
 

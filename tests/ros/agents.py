@@ -47,11 +47,24 @@ class Agent(NamedTuple):
 
 def agent_of(graph: Graph, folder: Path, *sources: dict[str, Any], arguments: tuple[str, ...] = ()) -> Agent:
     """Return the real agent in a graph, without a reachable broker."""
+    command = (
+        "iort_agent.cli",
+        "run",
+        "--config",
+        configuration(folder, *sources),
+        "--drain-s",
+        0,
+        *arguments,
+    )
+    return Agent(graph.module(*map(str, command)), folder)
+
+
+def configuration(folder: Path, *sources: dict[str, Any]) -> Path:
+    """Return the car.yaml of an agent without a reachable broker."""
     text = yaml.safe_dump(list(sources), default_flow_style=True, width=1000).strip()[1:-1]
     config = config_file(folder, text, "queue: {path: queue.db}\nport: 1")
     self_signed(folder)
     for made, named in (("private.key", "key.pem"), ("certificate.pem", "cert.pem")):
         (folder / made).replace(folder / named)
     (folder / "ca.pem").write_bytes((folder / "cert.pem").read_bytes())
-    command = ("iort_agent.cli", "run", "--config", config, "--drain-s", 0, *arguments)
-    return Agent(graph.module(*map(str, command)), folder)
+    return config

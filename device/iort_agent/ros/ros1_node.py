@@ -201,6 +201,13 @@ class Node:
             return False  # shutting down
         return True
 
+    def types(self) -> Mapping[str, Sequence[str]]:
+        """The topics that somebody publishes, and the types of each; none while no master answers."""
+        try:
+            return {topic: [kind] for topic, kind in self._master.ask("getPublishedTopics", "")}
+        except ros1_master.ERRORS:
+            return {}
+
     def connections(self, topic: str) -> int:
         """How many publishers a subscribed topic is connected to."""
         return _connections(self._subscribers.get(self.resolve(topic)))

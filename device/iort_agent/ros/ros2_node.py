@@ -182,6 +182,10 @@ class Node:
         publisher.publish(data)
         return True
 
+    def types(self) -> Mapping[str, Sequence[str]]:
+        """The topics that somebody publishes or hears, and the types of each."""
+        return self._session.topics()
+
     def connections(self, topic: str) -> int:
         """How many publishers a subscribed topic is connected to."""
         wanted = self._wanted.get(self.resolve(topic))
