@@ -162,8 +162,9 @@ class Writer:
     def _text(self, field: Field, value: Any, path: str) -> None:
         text = _encoded(value, path, "utf-8" if field.kind == STRING else "utf-16-le")
         units = len(text) if field.kind == STRING else len(text) // 2
+        # Of a wstring, each unit of UTF-16 counts.
         if field.longest is not None and units > field.longest:
-            raise MessageError(f"{path}: must have at most {field.longest} characters, got {units}")
+            raise MessageError(f"{path}: must have at most {field.longest} bytes, got {units}")
         if field.kind == STRING and self._ros2:
             if b"\0" in text:
                 raise _wrong(path, value, "a text without NUL")
@@ -269,7 +270,7 @@ def _zero(field: Field) -> Any:
         return False
     if field.kind in LETTERS:
         return 0
-    return "" if field.kind == STRING else {}
+    return "" if field.kind in TEXTS else {}
 
 
 def _time(value: Mapping[str, Any], path: str, *, strict: bool) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES
 from iort_contract.catalog.vesc import LOG_UNITS, VESC, VESC_STREAM
 from iort_contract.dynamodb import with_samples_between
 from iort_contract.limits import ContractError, MessageError
-from iort_contract.ros.definition import Fields, parse
+from iort_contract.ros.definition import Fields, is_ros2, parse, short_kind
 from iort_contract.ros.message import MessageType, message_type
 from iort_contract.tables import STATS, STREAMS
 from iort_station.cloud import Cloud
@@ -52,10 +52,11 @@ def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> s
         return found
     if stream == VESC_STREAM and (found := VESC.unit(field, ros2=ros2)):
         return found
-    if field in LOG_UNITS and (stream == VESC_STREAM if kind is None else kind.kind == VESC_KIND):
+    name = "" if kind is None else short_kind(kind.kind)
+    if field in LOG_UNITS and (stream == VESC_STREAM if kind is None else name == VESC_KIND):
         return LOG_UNITS[field]
     # The driver's VescImu has fields of these names in other units.
-    if kind is not None and kind.kind.startswith("vesc_msgs/"):
+    if name.startswith("vesc_msgs/"):
         return ""
     within, _, axis = field.rpartition(".")
     known_as = (of for of in streams.ROS_UNITS if within == of or within.endswith(f".{of}"))
@@ -64,10 +65,11 @@ def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> s
 
 def _by_type(kind: MessageType, path: str, *, ros2: bool) -> str:
     types = _fields_of_type(kind.kind, kind.definition)
-    body = [field for field in types.get(kind.kind, ()) if field.name != "header"]
+    name, ros2 = short_kind(kind.kind), ros2 or is_ros2(kind.kind)
+    body = [field for field in types.get(name, ()) if field.name != "header"]
     # With a header and one other field, the sample's fields are that field's: see
     # contract/iort_contract/ros/decode.py.
-    starts = [body[0].kind, kind.kind] if len(body) == 1 else [kind.kind]
+    starts = [body[0].kind, name] if len(body) == 1 else [name]
     return next(filter(None, (_on_the_way(types, start, path, ros2=ros2) for start in starts)), "")
 
 

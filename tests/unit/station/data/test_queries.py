@@ -382,6 +382,7 @@ def test_a_field_has_its_known_unit(stream: str, name: str, expected: str) -> No
 
 LINE = "=" * 80 + "\n"
 HEADER = LINE + "MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+ROS2_HEADER = LINE + "MSG: std_msgs/msg/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
 VECTOR = LINE + "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 VESC_STATE = LINE + "MSG: vesc_msgs/VescState\nfloat64 speed\nfloat64 charge_drawn\nint32 fault_code\n"
 STAMPED_VESC = "Header header\nvesc_msgs/VescState state\n" + HEADER + VESC_STATE
@@ -417,6 +418,10 @@ OWN += "float64 speed\n" + VESC_STATE + LINE + "MSG: sensor_msgs/Range\nfloat32 
 )  # fmt: skip
 def test_the_unit_follows_from_the_type_of_the_messages(kind, definition, name, expected):
     assert unit("any", name, kind=MessageType("any", "/t", kind, "", definition)) == expected
+    ros2_kind, ros2_definition = kind.replace("/", "/msg/"), definition.replace(HEADER, ROS2_HEADER)
+    # The ROS 2 driver counts in Ah.
+    ros2_unit = expected.replace("1e-4 ", "")
+    assert unit("any", name, kind=MessageType("any", "/t", ros2_kind, "", ros2_definition)) == ros2_unit
 
 
 def test_the_ros_2_driver_has_its_own_units_in_any_stream():
