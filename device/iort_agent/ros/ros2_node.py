@@ -35,6 +35,8 @@ _LOOK_S, _MISSING_S = 1.0, 0.2
 _AT_A_LOOK = 10
 _DEPTH = 10
 _JOIN_S = 3.0
+# The last messages may still be in memory that subscribers read, or have to be sent again.
+_LAST_WRITE_S = 0.2
 
 _lock = threading.Lock()
 _shared: list[Node] = []
@@ -103,6 +105,8 @@ class Node:
         self._stop.set()
         self._session.wake()
         self._thread.join(_JOIN_S)
+        if self._publishers:
+            threading.Event().wait(_LAST_WRITE_S)
         if not self._thread.is_alive():
             self._session.close()
 
