@@ -217,6 +217,11 @@ class DownlinkConfig:
         )
         # Without any of them, the ROS that was sourced.
         version = max(versions or {2 if os.environ.get("ROS_VERSION") == "2" else 1})
+        for name, command in self.cmd:
+            if version == 2 and re.search(r"/\d", command.topic):
+                raise ContractError(
+                    f"cmd.{name}.topic must have no part that begins with a digit, got {command.topic}"
+                )
         for key, kind in types.items():
             if is_ros2(kind) != (version == 2):
                 form = kind.replace("/", "/msg/") if version == 2 else kind.replace("/msg/", "/")

@@ -28,6 +28,7 @@ from typing import Any, Callable, Mapping, Union
 from iort_agent.common.threads import Clock, Supervised, SystemClock
 from iort_agent.control.leases import Stops
 from iort_agent.ros import ros1_node, ros2_node
+from iort_agent.ros.arguments import for_another
 from iort_agent.ros.json_message import encode
 
 _log = logging.getLogger("iort_agent.guard")
@@ -111,6 +112,7 @@ class Guard:
         ros: int = 1,
     ) -> None:
         file = str(queue.absolute()) if queue is not None else None
+        self._agent = agent
         self._first = _line({"agent": agent, "ros": ros, "stops": stops, "queue": file})
         self._clock = clock
         self._process: subprocess.Popen[bytes] | None = None
@@ -155,9 +157,7 @@ class Guard:
                 self._write(b"\n")
             return
         self._start_at = now + _AGAIN_S
-        remappings = [
-            argument for argument in sys.argv if ":=" in argument and not argument.startswith("__name:=")
-        ]
+        remappings = for_another(sys.argv[1:], self._agent)
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own module
                 [sys.executable, "-m", PROCESS, *remappings],

@@ -19,6 +19,8 @@ _WITH_VALUE = (
     *("-p", "--param", "-r", "--remap", "--params-file", "--log-level"),
     *("--log-config-file", "--log-file-name", "-e", "--enclave"),
 )
+# These are not of one node alone.
+_FOR_ALL = ("-r", "--remap", "-e", "--enclave")
 # A name with one underscore is a parameter.
 _REMAPPING = re.compile(r"(?:~|/|[A-Za-z]|__?)[\w/]*:=(?!.*:=).*", re.ASCII)
 _PARAMETER = re.compile(r"_[^_]")
@@ -74,6 +76,23 @@ def split(arguments: Sequence[str], node: str) -> Split:
             level = value.rpartition(":=")[2].lower()
             parameters[LOG_LEVEL] = _LEVELS.get(level, level)
     return Split(own, parameters, ignored)
+
+
+def for_another(arguments: Sequence[str], base: str) -> list[str]:
+    """The arguments that give another node the remappings of the node ``base``, but not its name."""
+    ros1: list[str] = []
+    ros2: list[str] = []
+    rest = iter(arguments)
+    for argument in rest:
+        if argument == _BEGIN:
+            for option, value in _ros2(rest):
+                # A rule may be for this node alone.
+                rule = value[len(base) + 1 :] if value.startswith(f"{base}:") else value
+                if option in _FOR_ALL and not _NODE.match(rule):
+                    ros2 += [option, rule]
+        elif is_remapping(argument) and not _NODE.match(argument):
+            ros1.append(argument)
+    return ros1 + ([_BEGIN, *ros2] if ros2 else [])
 
 
 def _ros2(rest: Iterator[str]) -> Iterator[tuple[str, str]]:

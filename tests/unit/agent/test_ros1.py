@@ -24,7 +24,7 @@ from iort_contract.limits import MessageError
 from iort_contract.ros.definition import parse
 from tests.rosbridge_json import as_rosbridge
 from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, RULE, T0
-from tests.unit.contract.ros.ros1_values import by_rosbags, definitions, values
+from tests.unit.contract.ros.ros_values import by_rosbags, definitions, values
 
 MIXED = f"""bool b
 int8 small

@@ -8,7 +8,7 @@ import pytest
 
 from iort_agent import cli
 from iort_agent.errors import ConfigError
-from iort_agent.ros.arguments import Split, split
+from iort_agent.ros.arguments import Split, for_another, split
 
 ROS2 = ["--ros-args", "-r", "__node:=recorder", "-r", "/a:=/b", "-p", "config:=car.yaml", "--"]
 
@@ -85,3 +85,12 @@ def test_the_agent_runs_with_the_configuration_of_its_parameters() -> None:
     # `ros2 launch` gives an empty text for what is not set.
     assert parsed(*ROS2[:-1], "-p", "log_level:=") == ("car.yaml", None, [])
     assert parsed("/a:=/b", "_rate:=5", "--config", "c") == ("c", None, ["_rate:=5"])
+
+
+def test_another_node_has_the_remappings_and_not_the_name() -> None:
+    given = ["run", "/a:=/b", "__name:=recorder", "--config", "c", "--ros-args", "-r", "__node:=recorder"]
+    given += ["-r", "__ns:=/lab", "--remap", "recorder:/drive:=/cmd", "-r", "recorder:__node:=x"]
+    given += ["-p", "config:=c", "-e", "/lab/agent", "--", "rest"]
+    ros2 = ["--ros-args", "-r", "__ns:=/lab", "--remap", "/drive:=/cmd", "-e", "/lab/agent"]
+    assert for_another(given, "recorder") == ["/a:=/b", *ros2]
+    assert for_another(["--config", "c", "--ros-args", "-p", "config:=c"], "recorder") == []

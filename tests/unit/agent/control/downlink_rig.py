@@ -92,6 +92,7 @@ class FakeGraph:
     """ROS topics in memory; what is published on one is heard on it."""
 
     ros = 1
+    base = "iort_agent"
 
     def __init__(self) -> None:
         self.published: list[tuple[str, bytes]] = []

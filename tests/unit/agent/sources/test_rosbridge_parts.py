@@ -13,7 +13,7 @@ from iort_contract.limits import MessageError
 from iort_contract.ros.definition import Definition, md5sum, parse
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import POSE
-from tests.unit.contract.ros.ros1_values import HEADER, definitions, text_of
+from tests.unit.contract.ros.ros_values import HEADER, definitions, text_of
 
 RULE = "=" * 80
 STATUS = """# what it is

@@ -106,12 +106,18 @@ def test_a_folder_has_messages_of_ros_2_byte_for_byte(tmp_path: Path) -> None:
     assert {qos.reliability, qos_latched.reliability} == {QosReliability.RELIABLE}
 
 
+# What rosidl of Jazzy says of std_msgs/msg/Char.
+CHAR = "RIHS01_3ad2d04dd29ba19d04b16659afa3ccaedd691914b02a64e82e252f2fa6a586a9"
+
+
 def test_a_hash_that_the_robot_did_not_have_is_made(tmp_path: Path) -> None:
-    kind = declared(JAZZY, POINT, "/point")
+    unknown = "sha256_" + "0" * 64
+    point, char = declared(JAZZY, POINT, "/point"), declared(JAZZY, "std_msgs/msg/Char", "/char")
     with bags.folder(tmp_path / "ride") as file:
-        file.topic(kind._replace(md5sum="sha256_" + "0" * 64)).write(T_NS, POINT_2)
-        file.topic(WHEELS._replace(md5sum="sha256_" + "0" * 64)).write(T_NS + 1, WHEELS_RAW)
-    assert [c.digest for c, _, _ in of_folder(tmp_path / "ride")] == [kind.md5sum, "sha256_" + "0" * 64]
+        for kind in (point, char, WHEELS):
+            file.topic(kind._replace(md5sum=unknown)).write(T_NS, WHEELS_RAW)
+    found = {c.topic: c.digest for c, _, _ in of_folder(tmp_path / "ride")}
+    assert found == {"/point": point.md5sum, "/char": CHAR, "/wheels": unknown}
 
 
 def test_a_message_of_ros_1_is_written_as_one_of_ros_2(tmp_path: Path) -> None:
