@@ -120,8 +120,8 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
         about.append(_once([rest.hex() for rest in rests]))
     if rows != numbers.bodies:
         return None
-    head = _about_heads(decoder, messages.raw, numbers.starts, times_us) if decoder.stamped else []
-    return None if head is None else (written, COMPACT.encode([*about, *head]))
+    heads = _about_heads(decoder, messages.raw, numbers.starts, times_us) if decoder.stamped else []
+    return None if heads is None else (written, COMPACT.encode([*about, *heads]))
 
 
 def _about_heads(
@@ -169,7 +169,7 @@ def from_columns(
             rests = list(map(bytes.fromhex, _each(head.pop(0), n, "the rest")))
         heads = [rest[:CDR_START] for rest in rests]
         if decoder.stamped:
-            heads = _heads(heads, head, times_us)
+            heads = _heads(decoder, heads, head, times_us)
         starts = list(map(len, heads))
         rows = _rows(_readers(decoder.flat, starts, ros2=decoder.ros2), names, columns)
         if len(rows) != n:
@@ -184,10 +184,13 @@ def from_columns(
     return Messages(name, layouts[name], raw)
 
 
-def _heads(starts: Sequence[bytes], about: Sequence[Any], times_us: Sequence[int]) -> list[bytes]:
-    """The headers, each behind the start of its message; ROS 1 has no start, and a seq in the header."""
+def _heads(
+    decoder: Decoder, starts: Sequence[bytes], about: Sequence[Any], times_us: Sequence[int]
+) -> list[bytes]:
+    """The headers, each behind the start of its message, which is empty in ROS 1."""
     n = len(times_us)
-    *seq, stamp, frame = about
+    # ROS 2 has no seq.
+    seq, stamp, frame = [0, *about] if decoder.ros2 else about
     offsets: Sequence[Any] = (
         [int(stamp[3 * i : 3 * i + 3]) for i in range(n)]
         if isinstance(stamp, str)
@@ -195,15 +198,15 @@ def _heads(starts: Sequence[bytes], about: Sequence[Any], times_us: Sequence[int
     )
     times = [divmod(t_us * 1000 + offset_ns, _NS) for t_us, offset_ns in zip(times_us, offsets)]
     contents = list(map(str.encode, _each(frame, n, "frame_id")))
-    if seq:
-        seqs = range(seq[0], seq[0] + n) if type(seq[0]) is int else unpacked("seq", seq[0], n)
+    if decoder.ros2:
         return [
-            HEADER.pack(number, sec, nanosec, len(content)) + content
-            for number, (sec, nanosec), content in zip(seqs, times, contents)
+            start + CDR_HEADER.pack(sec, nanosec, len(content) + 1)[CDR_START:] + content + b"\0"
+            for start, (sec, nanosec), content in zip(starts, times, contents)
         ]
+    seqs = range(seq, seq + n) if type(seq) is int else unpacked("seq", seq, n)
     return [
-        start + CDR_HEADER.pack(sec, nanosec, len(content) + 1)[CDR_START:] + content + b"\0"
-        for start, (sec, nanosec), content in zip(starts, times, contents)
+        HEADER.pack(number, sec, nanosec, len(content)) + content
+        for number, (sec, nanosec), content in zip(seqs, times, contents)
     ]
 
 
@@ -307,6 +310,8 @@ def _completed(
     for start, row, rest in zip(starts, rows, rests):
         gaps = decoder.flat.gaps(start % 8)
         end = CDR_START + len(gaps)
+        if not end <= len(rest) <= end + 3:
+            raise ContractError(f"the rest must have {end} bytes and what fills them up, got {len(rest)}")
         if any(rest[CDR_START:end]):
             content = bytearray(row)
             for gap, byte in zip(gaps, rest[CDR_START:]):

@@ -23,6 +23,7 @@ _OF_EACH = (_HEADER, "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Dura
 _EMPTY = "std_msgs/msg/Empty"
 # ROS 2 may bound a text or an array, which changes nothing in its bytes.
 _BOUND = re.compile(r"(?<=string)<=\d+|(?<=\[)<=\d+(?=\])")
+_CHAR = re.compile(r"^\s*char\b", re.MULTILINE)
 _LITTLE_ENDIAN = b"\0\1"
 
 
@@ -81,7 +82,9 @@ def _type_hash(kind: MessageType) -> str:
     if kind.md5sum.startswith("RIHS01_"):
         return kind.md5sum
     try:
-        return str(_store(get_types_from_msg(kind.definition, kind.kind)).hash_rihs01(kind.kind))
+        # ROS 2 hashes a char as what it is; the library does not.
+        types = get_types_from_msg(_CHAR.sub("uint8", kind.definition), kind.kind)
+        return str(_store(types).hash_rihs01(kind.kind))
     except Exception:  # noqa: BLE001 - as above
         return kind.md5sum or f"sha256_{hashlib.sha256(kind.definition.encode()).hexdigest()}"
 
@@ -134,5 +137,6 @@ def _converted(kind: MessageType, *, ros2: bool, own: bool) -> Form:
         note += ", without the seq of headers" if ros2 else ", with 0 as the seq of headers"
     if not same:
         note += ", fields by name"
-    md5sum = target.hash_rihs01(new) if ros2 else md5sum
+    if ros2:
+        md5sum = _type_hash(kind._replace(kind=new, definition=text, md5sum=""))
     return Form(new if ros2 else new.replace("/msg/", "/"), text, md5sum, ros2, note, convert)
