@@ -79,6 +79,7 @@ class Node:
         self.base = session.name.rpartition("/")[2]
         self.sim_time = session.sim_time
         self._types = types or Types()
+        self._names: dict[str, str] = {}
         self._wanted: dict[str, Topic] = {}
         # How `subscribe` made an `OnMessage` of each handler.
         self._takers: dict[tuple[str, OnBytes], OnMessage] = {}
@@ -116,7 +117,10 @@ class Node:
 
     def resolve(self, topic: str) -> str:
         """The topic's name in the graph, as the command line may remap it."""
-        return self._session.resolve(topic)
+        # A report comes after the node has left the graph, and can ask nobody any more.
+        if topic not in self._names:
+            self._names[topic] = self._session.resolve(topic)
+        return self._names[topic]
 
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages, of any type, in the node's thread."""

@@ -185,9 +185,6 @@ class _Subscription:
         if self in session.subscriptions:
             session.subscriptions.remove(self)
             session.waiter.change()
-            for handler in self.made.event_handlers:
-                with contextlib.suppress(ValueError):
-                    self._node.remove_waitable(handler)
             self._node.destroy_subscription(self.made)
 
 

@@ -17,6 +17,11 @@ from rosbags.rosbag2 import Reader
 OPEN_S, LAG_S = 2.5, 8.0
 
 
+def whole(data: bytes) -> bytes:
+    """Return the bytes as Fast DDS gives them to another process: filled with zeros to a multiple of four."""
+    return data + bytes(-len(data) % 4)
+
+
 class Sent(NamedTuple):
     """A message in its publisher's own record."""
 
@@ -108,9 +113,9 @@ class Account(NamedTuple):
 
     def row(self, topic: str, kind: str, publishers: Sequence[Publisher], named: int) -> Row:
         """Return a topic's account."""
-        sent = Counter(one.data for publisher in publishers for one in publisher.sent)
-        came = Counter(self.stored.messages.get(topic, ()))
-        taped = Counter(self.recorded.messages.get(topic, ()))
+        sent = Counter(whole(one.data) for publisher in publishers for one in publisher.sent)
+        came = Counter(map(whole, self.stored.messages.get(topic, ())))
+        taped = Counter(map(whole, self.recorded.messages.get(topic, ())))
         left, extra = sent - came, came - sent
         opened: Counter[bytes] = Counter()
         dead: Counter[bytes] = Counter()
@@ -140,12 +145,12 @@ def _excused(publisher: Publisher, kill: Kill, left: Counter[bytes]) -> tuple[li
     """
     killed, open_ns, lag_ns = kill.killed_ns, OPEN_S * 1e9, LAG_S * 1e9
     earlier = [one for one in reversed(publisher.sent) if killed - lag_ns <= one.t_ns < killed]
-    run = itertools.takewhile(lambda one: left[one.data] or one.t_ns >= killed - open_ns, earlier)
+    run = itertools.takewhile(lambda one: left[whole(one.data)] or one.t_ns >= killed - open_ns, earlier)
     if publisher.back is None:
-        later = [one.data for one in publisher.sent if killed <= one.t_ns <= kill.back_ns]
+        later = [whole(one.data) for one in publisher.sent if killed <= one.t_ns <= kill.back_ns]
     else:
-        later = [one.data for one in publisher.sent[: publisher.back] if killed <= one.t_ns]
-    return [one.data for one in run], later
+        later = [whole(one.data) for one in publisher.sent[: publisher.back] if killed <= one.t_ns]
+    return [whole(one.data) for one in run], later
 
 
 def _difference(left: Counter[bytes], extra: Counter[bytes]) -> str:

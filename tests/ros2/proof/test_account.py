@@ -8,12 +8,12 @@ from tests.ros2.proof.account import Account, Contents, Kill, Publisher, Sent, t
 
 S = 10**9
 # Ten messages a second; the agent died at 5 s, and the next one was found at 7 s, by message 70.
-SENT = [Sent(i * S // 10, b"%d" % i) for i in range(100)]
+SENT = [Sent(i * S // 10, b"%04d" % i) for i in range(100)]
 KILL = Kill(5 * S, 7 * S)
 
 
 def account(*missing: int, extra: int = 0, back: int | None = 70, named: int = 0):
-    stored = [one.data for i, one in enumerate(SENT) if i not in missing] + [b"0"] * extra
+    stored = [one.data for i, one in enumerate(SENT) if i not in missing] + [b"0000"] * extra
     contents = [Contents({}, {"/t": messages}) for messages in (stored, [one.data for one in SENT])]
     return Account(*contents, KILL).row("/t", "a/msg/B", [Publisher(SENT, back)], named)
 
