@@ -187,7 +187,12 @@ class Node:
         publisher = self._publishers.get(self.resolve(topic))
         if publisher is None or self._stop.is_set():
             return False
-        publisher.publish(data)
+        try:
+            publisher.publish(data)
+        except Exception:
+            if not self._stop.is_set():
+                raise
+            return False  # shutting down
         return True
 
     def types(self) -> Mapping[str, Sequence[str]]:
@@ -197,12 +202,12 @@ class Node:
     def connections(self, topic: str) -> int:
         """How many publishers a subscribed topic is connected to."""
         wanted = self._wanted.get(self.resolve(topic))
-        return wanted.connections() if wanted is not None else 0
+        return wanted.connections() if wanted is not None and not self._stop.is_set() else 0
 
     def listeners(self, topic: str) -> int:
         """How many subscribers an advertised topic is connected to."""
         publisher = self._publishers.get(self.resolve(topic))
-        return publisher.subscribers() if publisher is not None else 0
+        return publisher.subscribers() if publisher is not None and not self._stop.is_set() else 0
 
     def living(self, base: str) -> frozenset[str]:
         """What tells the nodes of this name, in our namespace, apart: an identifier of each in the graph. One
