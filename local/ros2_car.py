@@ -208,7 +208,8 @@ def main() -> None:
     signals = importlib.import_module("rclpy.signals").SignalHandlerOptions
     rclpy.init(args=[], signal_handler_options=signals.NO)
     car = Car(source.graph, config.vehicle.wheelbase_m, config.vehicle.speed_to_erpm_gain)
-    threading.Thread(target=rclpy.spin, args=(car.node,), daemon=True).start()
+    spinning = threading.Thread(target=rclpy.spin, args=(car.node,), daemon=True)
+    spinning.start()
     wait = threading.Event().wait
     while not all(publisher.get_subscription_count() for publisher in car.publishers.values()):
         wait(0.05)  # rclpy has no event for it
@@ -218,6 +219,7 @@ def main() -> None:
     sys.stdout.write(json.dumps(car.sent) + "\n")
     sys.stdout.flush()
     rclpy.shutdown()
+    spinning.join()
 
 
 if __name__ == "__main__":
