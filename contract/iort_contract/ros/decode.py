@@ -21,9 +21,9 @@ from typing import Dict, Sequence
 from iort_contract.limits import MAX_FIELDS, MessageError, Value
 from iort_contract.ros.definition import (
     LETTERS,
-    STRING,
     TEXTS,
     VARIABLE,
+    WSTRING,
     Definition,
     Field,
     Fields,
@@ -41,6 +41,7 @@ from iort_contract.ros.plan import (
     cdr_order,
     cdr_text,
     fits,
+    is_loose,
     padding,
 )
 
@@ -113,6 +114,8 @@ class Decoder:
         self._length = struct.Struct(f"{order}I")
         self._big_endian: Decoder | None = None
         self._compiled = Types(definition.types, self.wanted, aligned=self.ros2, order=order)
+        # Only ever grows, so that a thread does not miss what another one counts.
+        self._loose = 0
         self._chosen: dict[str, bool] = {}
         name = short_kind(self._kind)
         fields = definition.fields()
@@ -138,6 +141,7 @@ class Decoder:
             if data[:2] != CDR_LITTLE and self._order == "<":
                 return self._decode_big_endian(data)
         values: dict[str, Value] = {}
+        loose = self._loose
         try:
             if self.stamped:
                 # The method costs more than what it does.
@@ -145,7 +149,7 @@ class Decoder:
             at = self._read(self._body, "", data, at, values)
         except struct.error as error:
             raise MessageError(f"{self._kind}: the message of {len(data)} bytes is truncated") from error
-        if at != len(data) and not fits(at, len(data), ros2=self.ros2):
+        if at != len(data) and not fits(at, len(data), ros2=self.ros2, loose=self._loose - loose):
             raise MessageError(f"{self._kind}: the message must have {at} bytes, got {len(data)}")
         if self._select is not None:
             values = {path: value for path, value in values.items() if self.wanted(path)}
@@ -201,7 +205,10 @@ class Decoder:
                 at += padding(at, 4)
             (n,) = self._length.unpack_from(data, at)
             at += 4
-            end = at + (n if kind == STRING else 4 * n)
+            end = at + n
+            if kind == WSTRING:
+                end += 3 * n
+                self._loose += 1
             if path is not None:
                 text = None
                 if end - at <= 4 * MAX_TEXT:
@@ -236,6 +243,8 @@ class Decoder:
         if kind in LETTERS:
             if self.ros2 and n:
                 at += padding(at, SIZES[kind])
+            elif self.ros2:
+                self._loose += is_loose(kind, n)
             size = n * SIZES[kind]
         elif extent is not None:
             size = extent.times(n, at & self._mask)

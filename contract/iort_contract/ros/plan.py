@@ -3,8 +3,8 @@
 ROS 1 packs values without gaps. ROS 2's CDR aligns each number to its own size, up to 8, counted from the end
 of the 4 bytes that tell the byte order; so the size of a type depends on its place modulo 8, its phase. In
 ROS 1 every phase is 0. CDR differs in this, too: a text ends with a NUL that counts; a wstring has 4 bytes
-for each unit of UTF-16, as Fast DDS and Cyclone DDS write it; an empty message has one byte; and up to 3
-bytes may follow, which fill the message up to a multiple of 4.
+for each unit of UTF-16, as Fast DDS and Cyclone DDS write it; an empty message has one byte; and bytes may
+follow, which fill the message up to a multiple of 4 or were reserved for nothing.
 """
 
 from __future__ import annotations
@@ -31,9 +31,22 @@ def padding(at: int, size: int) -> int:
     return (CDR_START - at) % size
 
 
-def fits(end: int, size: int, *, ros2: bool) -> bool:
-    """Whether a message whose fields end there may have this size."""
-    return end == size or (ros2 and size == end + padding(end, 4))
+def fits(end: int, size: int, *, ros2: bool, loose: int = 0) -> bool:
+    """Whether a message whose fields end there may have this size.
+
+    ``loose`` counts the values in it that make Fast DDS reserve too much (`is_loose`).
+    """
+    return end == size or (
+        ros2 and (size == end + padding(end, 4) or end < size <= end + (8 * loose and 8 * loose + 3))
+    )
+
+
+def is_loose(kind: str, length: int) -> bool:
+    """Whether Fast DDS reserves up to 8 bytes more for such a value of ROS 2 than it writes.
+
+    What it has not written stays at the end of a message that was serialized before it was published.
+    """
+    return kind == WSTRING or (length == 0 and SIZES.get(kind) == 8)
 
 
 def cdr_order(kind: str, data: bytes) -> str:

@@ -29,7 +29,7 @@ from iort_contract.ros.definition import (
     Field,
     short_kind,
 )
-from iort_contract.ros.plan import CDR_LITTLE, CDR_START, SIZES, cdr_order, cdr_text, fits, padding
+from iort_contract.ros.plan import CDR_LITTLE, CDR_START, SIZES, cdr_order, cdr_text, fits, is_loose, padding
 
 _LENGTH = struct.Struct("<I")
 # A message of JSON within the broker's limit has no more elements; nested empty ones could have.
@@ -64,7 +64,7 @@ def decode(definition: Definition, data: bytes) -> dict[str, Any]:
         message = reader.read(Field("", short_kind(definition.kind), None))
     except struct.error as error:
         raise MessageError(f"{definition.kind}: the message of {len(data)} bytes is truncated") from error
-    if not fits(reader.at, len(data), ros2=definition.ros2):
+    if not fits(reader.at, len(data), ros2=definition.ros2, loose=reader.loose):
         raise MessageError(f"{definition.kind}: the message must have {reader.at} bytes, got {len(data)}")
     assert isinstance(message, dict)
     return message
@@ -303,10 +303,10 @@ def _join(path: str, name: str) -> str:
 
 
 class _Reader:
-    """Reads a message's bytes from ``at`` on."""
+    """Reads a message's bytes from ``at`` on, and counts what is ``loose`` for `fits`."""
 
     def __init__(self, definition: Definition, data: bytes) -> None:
-        self.at = 0
+        self.at = self.loose = 0
         self._definition = definition
         self._data = data
         self._ros2 = definition.ros2
@@ -321,10 +321,12 @@ class _Reader:
             n = self._number("uint32") if field.length == VARIABLE else field.length
             if n > _MAX_ELEMENTS:
                 raise MessageError(f"{field.name}: must have at most {_MAX_ELEMENTS} elements, got {n}")
+            self.loose += is_loose(field.kind, n)
             return [self.read(field.element()) for _ in range(n)]
         if field.kind in LETTERS:
             return self._number(field.kind)
         if field.kind in TEXTS:
+            self.loose += is_loose(field.kind, 1)
             n = self._number("uint32") * (1 if field.kind == STRING else 4)
             if self.at + n > len(self._data):
                 raise struct.error

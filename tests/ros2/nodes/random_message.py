@@ -6,7 +6,7 @@ import random
 from rosidl_parser import definition
 from rosidl_runtime_py.utilities import get_interface
 
-_WORDS = ("", "base_link", "grün", "übergröße", "世界", "🏎", "joint_1", "two\nlines")
+WORDS = ("", "base_link", "grün", "übergröße", "世界", "🏎", "joint_1", "two\nlines")
 _EDGES = (math.inf, -math.inf, math.nan, -0.0)
 _BITS = {f"{sign}int{bits}": (sign, bits) for sign in ("", "u") for bits in (8, 16, 32, 64)}
 
@@ -34,7 +34,7 @@ class Values:
             length = self._lengths.get(name, self._random.randrange(5))
             return self._several(kind, min(length, getattr(kind, "maximum_size", length)), name)
         if isinstance(kind, definition.AbstractGenericString):
-            return self._random.choice(_WORDS)[: getattr(kind, "maximum_size", 100)]
+            return self._random.choice(WORDS)[: getattr(kind, "maximum_size", 100)]
         if isinstance(kind, definition.NamespacedType):
             return self.fill(get_interface("/".join(kind.namespaced_name()))())
         return self._number(kind.typename)

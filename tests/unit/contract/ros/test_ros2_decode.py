@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from iort_contract.limits import MAX_FIELDS, MessageError
 from iort_contract.ros.decode import Decoder, stamp_ns
 from iort_contract.ros.definition import VARIABLE, Field, layout, parse, short_kind
-from iort_contract.ros.plan import MAX_ELEMENTS
+from iort_contract.ros.plan import MAX_ELEMENTS, SIZES
 from tests.examples import examples
 from tests.unit.contract.ros.ros2_messages import HEADER, LINE, STAMPED, Cdr
 from tests.unit.contract.ros.ros_values import by_rosbags, definitions, values, view_of
@@ -177,6 +177,25 @@ def test_bytes_that_do_not_fit_the_definition_are_refused(
             decoded(definition, data, select=select)
 
 
+@ORDERS
+def test_what_fast_dds_reserved_for_nothing_may_follow(order: str) -> None:
+    """As its serialize_message gives a JointState without positions, and a text of a wstring."""
+    for definition, data, most in (
+        (
+            "string[] name\nfloat64[] a\nfloat64[] b\nuint8 c",
+            Cdr(order).put("I", 0, 0, 0).put("B", 1).data,
+            19,
+        ),
+        ("wstring s", Cdr(order).wide("ab").data, 11),
+        ("float64[] a\nuint8[] b\nint64[] c", Cdr(order).put("I", 1).put("d", 1).put("I", 0, 0).data, 11),
+    ):
+        expected = decoded(definition, data)
+        for more in range(1, most + 1):
+            assert decoded(definition, data + b"x" * more) == expected
+        with pytest.raises(MessageError, match=f"must have {len(data)} bytes, got {len(data) + most + 1}"):
+            decoded(definition, data + b"x" * (most + 1))
+
+
 @pytest.mark.parametrize(
     "start", ["", "00", "0001", "000100", "0002", "0003", "0006", "0007", "0100", "0a00"]
 )
@@ -283,10 +302,17 @@ def test_a_truncated_or_longer_message_is_refused(data: Any) -> None:
     for end in range(len(raw)):
         with pytest.raises(MessageError):
             decoder.decode(raw[:end])
-    for more in range(1, 9):
+    # An empty array of numbers of 8 bytes lets bytes be behind the fields.
+    fields = [field for fields in definition.types.values() for field in fields]
+    least = 9 * len(raw) if any(map(may_be_loose, fields)) else 1
+    for more in range(least, least + 8):
         if (len(raw) + more) % 4 or more > 3:
             with pytest.raises(MessageError):
                 decoder.decode(raw + bytes(more))
+
+
+def may_be_loose(field: Field) -> bool:
+    return field.length == VARIABLE and SIZES.get(field.kind) == 8
 
 
 @examples(150)
