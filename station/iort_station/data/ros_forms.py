@@ -24,7 +24,7 @@ _EMPTY = "std_msgs/msg/Empty"
 # ROS 2 may bound a text or an array, which changes nothing in its bytes.
 _BOUND = re.compile(r"(?<=string)<=\d+|(?<=\[)<=\d+(?=\])")
 _CHAR = re.compile(r"^\s*char\b", re.MULTILINE)
-_LITTLE_ENDIAN = b"\0\1"
+_LITTLE_ENDIAN, _CDR_START = b"\0\1", 4
 
 
 class ConversionError(StationError):
@@ -123,10 +123,14 @@ def _converted(kind: MessageType, *, ros2: bool, own: bool) -> Form:
     )  # fmt: skip
 
     def convert(message: bytes) -> bytes:
+        # What converts directly reads little-endian messages only.
+        little = message[:2] == _LITTLE_ENDIAN
         try:
-            # What converts directly reads little-endian messages only.
-            one = direct if same and (ros2 or message[:2] == _LITTLE_ENDIAN) else migrate
-            return bytes(one(message))
+            if little and not ros2:
+                # Bytes may follow that the middleware had reserved for nothing.
+                size_of = source.get_msgdef(name).getsize_cdr_to_ros1
+                message = message[: _CDR_START + size_of(message[_CDR_START:], 0, None, 0, source)[0]]
+            return bytes((direct if same and (ros2 or little) else migrate)(message))
         except Exception as error:
             raise ConversionError(f"a message does not fit {kind.kind}: {error}") from error
 
