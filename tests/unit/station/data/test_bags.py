@@ -140,7 +140,7 @@ def test_a_message_of_ros_2_is_written_into_a_bag_as_one_of_ros_1(tmp_path: Path
         write, form = file.topic(kind)
         write(T_NS, POINT_2)
         # Fast DDS may reserve too much.
-        write(T_NS, POINT_2 + bytes(8))
+        write(T_NS, bytes(POINT_2) + bytes(8))
         write(
             T_NS + 1, JAZZY.serialize_cdr(JAZZY.deserialize_cdr(POINT_2, POINT), POINT, little_endian=False)
         )
