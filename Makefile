@@ -9,7 +9,7 @@ bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 .PHONY: help demo up down up-service up-password test test-all test-heavy test-fast test-oldest mutants check setup prove-mixed prove-ros2 wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
-	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
+	@grep -hE '^[a-z0-9-]+:.*## ' Makefile | sed -E 's/^([a-z0-9-]+):.*## /\1\t/' | expand -t 14
 
 setup: ## set up .venv, node_modules and build/, nothing outside this folder
 	@$(PYTHON) scripts/setup.py

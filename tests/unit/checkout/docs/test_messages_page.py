@@ -12,17 +12,25 @@ from typing import Any
 
 import pytest
 
-from iort_contract.codec import CODEC, DICTIONARY, ROS1_CODEC, inflate
+from iort_contract.codec import CODEC, DICTIONARY, ROS1_CODEC, ROS2_CODEC, inflate
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_contract.ros.message import Messages, RosType
 from testkit.ros1_types import Message
 from tests.messages_page import EXAMPLES, PAGE
+from tests.unit.contract.ros.ros2_messages import HEADER, Cdr
 
 TIMES_US = [1_700_000_000_000_000, 1_700_000_000_020_000, 1_700_000_000_040_001]
 NUMBERS, BREAK = "<dI?", b"\n"
 MADE = Message("a_msgs/Made", {"a_msgs/Made": "Header header\nfloat64 speed\nuint32 count\nbool on"})
 STAMPED = RosType("/made", MADE.kind, MADE.md5sum, MADE.definition)
 TEXT = RosType("/text", "std_msgs/String", "1" * 32, "string data # a text\n")
+ROS2_STAMPED = RosType(
+    "/made",
+    "a_msgs/msg/Made",
+    "RIHS01_",
+    f"std_msgs/Header header\nbool a\nfloat64 b\nuint32 c\nint8 d\n{HEADER}",
+)
+ROS2_TEXT = RosType("/text", "std_msgs/msg/String", "RIHS01_", "string data # a text\n")
 UNREADABLE = RosType("/text", "std_msgs/String", "1" * 32, "no definition at all")
 
 
@@ -65,6 +73,14 @@ def test_the_pages_examples_are_valid_bodies_of_batches() -> None:
     raw = [
         struct.pack("<IIII3si", seq, 0, t_us * 1000 + ns, 3, b"map", 7)
         for seq, t_us, ns in zip((5, 6, 7), times, (0, 3, 6), strict=True)
+    ]
+    body = body_of(Batch("0badcafe", 7, times, {}, 0, Messages(kind.id, kind.layout, raw)))
+    assert f"    {body.partition(BREAK)[2].decode()}\n" in PAGE
+
+    kind = RosType("/x", "a/msg/X", "0" * 32, f"std_msgs/Header header\nint32 a\n{HEADER}")
+    raw = [
+        Cdr().header(0, t_us * 1000 + ns, "map").put("i", 7).data
+        for t_us, ns in zip(times, (0, 3, 6), strict=True)
     ]
     body = body_of(Batch("0badcafe", 7, times, {}, 0, Messages(kind.id, kind.layout, raw)))
     assert f"    {body.partition(BREAK)[2].decode()}\n" in PAGE
@@ -115,6 +131,38 @@ def test_the_pages_reader_restores_numeric_messages(
     times_us, columns, behind = page["opened"](batch)
     assert json.loads(behind)[0] == STAMPED.id
     assert list(page["made_again"](times_us, columns, behind, NUMBERS)) == raw
+
+
+@pytest.mark.parametrize(
+    ("offsets_ns", "frames", "gap", "end"),
+    [
+        ([0, 7, 999], ["map"] * 3, b"\0", b""),
+        ([-1, 5000, 0], ["map", "", "odom"], b"\0", b"abc"),
+        ([-(TIMES_US[0] + 10**6) * 1000, 0, 0], [""] * 3, b"\x07", b""),
+    ],
+)
+def test_the_pages_reader_restores_numeric_messages_of_ros_2(
+    page: Mapping[str, Any], offsets_ns: list[int], frames: list[str], gap: bytes, end: bytes
+) -> None:
+    raw = []
+    for i, (t_us, ns, frame) in enumerate(zip(TIMES_US, offsets_ns, frames, strict=True)):
+        sec, nanosec = divmod(t_us * 1000 + ns, 10**9)
+        cdr = Cdr().header(sec, nanosec, frame).put("B", i == 1)
+        cdr.data += gap * (-(len(cdr.data) - 4) % 8)
+        whole = cdr.put("d", 4613.5 + i / 4).put("I", 2**32 - 1 - i).put("b", -i).data
+        raw.append(whole + end[: -len(whole) % 4])
+    batch = batch_of({}, Messages(ROS2_STAMPED.id, ROS2_STAMPED.layout, raw))
+    assert batch["codec"] == CODEC
+    times_us, columns, behind = page["opened"](batch)
+    assert list(page["made_again_of_ros2"](times_us, columns, behind, "?dIb")) == raw
+
+
+def test_the_pages_reader_reads_messages_of_ros_2_as_they_were_published(page: Mapping[str, Any]) -> None:
+    raw = [Cdr().text(text).data for text in ("ab", "", "abc")]
+    batch = batch_of({}, Messages(ROS2_TEXT.id, ROS2_TEXT.layout, raw))
+    assert batch["codec"] == ROS2_CODEC
+    _, _, behind = page["opened"](batch)
+    assert page["as_published"](batch["n"], behind) == raw
 
 
 @pytest.mark.parametrize("kind", [TEXT, UNREADABLE])
