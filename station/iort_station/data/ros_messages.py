@@ -18,6 +18,7 @@ from iort_contract.ros.definition import (
     LETTERS,
     STRING,
     VARIABLE,
+    WSTRING,
     Definition,
     Field,
     is_ros2,
@@ -30,6 +31,7 @@ from iort_station.data import inventory
 from iort_station.data.ros_forms import form_of
 from iort_station.errors import StationError
 
+_WSTRING = re.compile(rf"\b{WSTRING}\b")
 _HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 
 
@@ -48,7 +50,8 @@ def in_ros1(kind: MessageType) -> MessageType:
     """A type of ROS 2 as one of ROS 1 that becomes ROS 2's again in a file that can hold it."""
     if not is_ros2(kind.kind):
         return kind
-    form = form_of(kind, ros2=False, own=True)
+    # ROS 1 has one kind of text.
+    form = form_of(kind._replace(definition=_WSTRING.sub(STRING, kind.definition)), ros2=False, own=True)
     return kind._replace(kind=form.kind, definition=form.definition, md5sum=form.md5sum, converted_from=ROS2)
 
 

@@ -13,10 +13,10 @@ from iort_analysis.samples.blocks import Block, column_of
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.batch import Batch
-from iort_contract.ros.message import MessageType, message_type
+from iort_contract.ros.message import ROS2, MessageType, message_type
 from iort_contract.topics import build_topic
 from iort_station.data import bags
-from iort_station.data.ros_messages import Maker, made_of, types
+from iort_station.data.ros_messages import Maker, in_ros1, made_of, types
 from iort_station.errors import StationError
 from testkit.dynamodb import TELEMETRY, item_of
 from tests.flatten import flatten
@@ -87,6 +87,15 @@ def test_fields_may_have_names_of_python_keywords():
     _, _, message = made("float64 from\nB class\n" + LINE + "MSG: a_msgs/B\nint32 lambda\n",
                          {"from": 1.5, "class.lambda": 3})  # fmt: skip
     assert (message.from_, message.class_.lambda_) == (1.5, 3)
+
+
+def test_a_type_of_ros_2_becomes_one_of_ros_1_with_the_same_fields():
+    text = "wstring<=9 label\nint32[<=3] D\nbuiltin_interfaces/Duration took\nuint8 KIND=3\n"
+    kind = in_ros1(MessageType("s", "/t", "a_msgs/msg/A", "RIHS01_" + "0" * 64, text))
+    assert (kind.kind, kind.converted_from) == ("a_msgs/A", ROS2)
+    assert kind.definition == "uint8 KIND=3\nstring label\nint32[] D\nduration took\n"
+    assert in_ros1(kind) == kind
+    Maker(kind, ["label", "D.0", "took.sec"])
 
 
 def test_null_missing_and_unknown_fields_are_handled():
