@@ -25,7 +25,8 @@ from iort_agent.sources.recording import BagConfig
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.files import ATTACHMENT_FIELDS
-from iort_contract.ros.decode import Large
+from iort_contract.ros.decode import Decoder, Large
+from iort_contract.ros.definition import parse
 from iort_contract.ros.message import ROS2, Messages, MessageType, RosMessage, RosType, cut
 from iort_contract.topics import RECORD, build_topic
 from iort_station.data import bags
@@ -421,3 +422,20 @@ def test_samples_of_ros_2_become_messages_of_it_and_so_do_those_beside_them(tmp_
         assert [one.header.stamp.sec - T0_US // 1_000_000 for one in points] == [0, 2, 4]
         assert [message.ms for topic, message in found if topic.startswith("/rtt_2")] == [0, 0.5, 1]
         assert [message.lost for topic, message in found if topic == "/rtt_2_2"][-1] == 2
+
+
+def test_contents_stored_as_files_are_restored_in_messages_of_ros_2() -> None:
+    text = "uint8[] a\nfloat64 x\nstring format\nuint8[] b"
+    kind, store = RosType("/image", "a_msgs/msg/Image", "4", text), get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, "a_msgs/msg/Image"))
+    a, b = np.frombuffer(A, np.uint8), np.frombuffer(B, np.uint8)
+    message = store.types["a_msgs/msg/Image"](a=a, x=1.5, format="jpeg", b=b)
+    whole = bytes(store.serialize_cdr(message, "a_msgs/msg/Image"))
+    contents = Decoder(parse("a_msgs/msg/Image", text), large=True).decode(whole)
+    less, at_a = cut(whole, contents["a"], ros2=True)
+    less, at_b = cut(less, contents["b"], len(whole) - len(less), ros2=True)
+    beside = {**attachment("a", at_a, "k/a", A), **attachment("b", at_b, "k/b", B)}
+    types = {kind.id: MessageType("vesc", "/image", "a_msgs/msg/Image", "4", text)}
+    found, export = exported(of(kind, [less], **beside), types=types, content={"k/a": A, "k/b": B}.get)
+    assert (found, export.empty) == ([(0, kind.id, whole)], 0)
+    assert len(less) < len(whole)
