@@ -131,7 +131,7 @@ class Decoder:
         self.unknown = sorted(path for path in select or () if not self._has(path.split("."), body))
         self.flat: Run | None = None
         if len(self._body) == 1 and isinstance(self._body[0], Run) and self._body[0].numbers <= MAX_FIELDS:
-            self.flat = self._body[0] if self._body[0].numbers else None
+            self.flat = self._body[0] if self._body[0].named("")[1] else None
 
     def decode(self, data: bytes) -> dict[str, Value]:
         """The message as a sample; raises `MessageError` if the bytes do not fit the definition."""

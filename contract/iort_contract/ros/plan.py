@@ -98,8 +98,8 @@ class Extent(NamedTuple):
         return total
 
 
-# A number's kind and its path; or a number of bytes without one.
-_Leaf = Tuple[Union[str, int], str]
+# A number's kind and its path, which are empty for the byte of an empty type.
+_Leaf = Tuple[str, str]
 
 
 class Run:
@@ -127,11 +127,11 @@ class Run:
             names, letters = [], [self._types.order]
             at = phase
             for kind, path in self._leaves:
-                size = kind if isinstance(kind, int) else SIZES[kind]
-                gap = padding(at, size) if self._types.aligned and not isinstance(kind, int) else 0
+                size = SIZES.get(kind, 1)
+                gap = padding(at, size) if self._types.aligned else 0
                 at += gap + size
                 letters.append("x" * gap)
-                if not isinstance(kind, int) and self._types.wanted(prefix + path):
+                if kind and self._types.wanted(prefix + path):
                     names.append(prefix + path)
                     letters.append(LETTERS[kind])
                 else:
@@ -156,15 +156,14 @@ class Run:
         extent = self._types.extent_of(field)
         # A type without numbers may have any number of fields.
         if extent is None or not extent.numbers:
-            if extent is not None and extent.sizes[0]:
-                yield extent.sizes[0], ""
             return
+        nested = self._types.fields.get(field.kind, ())
         for i in range(1 if field.length is None else field.length):
             here = path if field.length is None else f"{path}.{i}"
-            if field.kind in LETTERS:
-                yield field.kind, here
-            for nested in self._types.fields.get(field.kind, ()):
-                yield from self._expand(nested, f"{here}.{nested.name}")
+            if not nested:
+                yield (field.kind, here) if field.kind in LETTERS else ("", "")
+            for inner in nested:
+                yield from self._expand(inner, f"{here}.{inner.name}")
 
 
 # A `Run`, or a field that is read by itself: a text, an array, a message of variable size.
@@ -223,7 +222,8 @@ class Types:
         """The extent of a type; None if its size varies."""
         if kind not in self._extents:
             fields = self.fields[kind]
-            empty = Extent([1] * len(self._phases), 0) if self.aligned and not fields else None
+            # A byte counts, so that no type has too many of them.
+            empty = Extent([1] * len(self._phases), 1) if self.aligned and not fields else None
             self._extents[kind] = empty or self._together(fields)
         return self._extents[kind]
 

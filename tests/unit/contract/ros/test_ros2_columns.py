@@ -21,7 +21,7 @@ from iort_contract.ros.definition import parse
 from iort_contract.ros.message import Messages, MessageType, RosMessage, RosType, cut, filled, message_type
 from tests.examples import examples
 from tests.unit.contract.contract_values import BOOT, json_values
-from tests.unit.contract.ros.ros2_messages import HEADER, Cdr
+from tests.unit.contract.ros.ros2_messages import HEADER, LINE, Cdr
 from tests.unit.contract.ros.ros_values import by_rosbags, definitions, text_of, values
 
 T0 = 1_700_000_000_000_000
@@ -31,9 +31,10 @@ FLAT = RosType(
 )
 STAMPED = RosType("/stamped", "a_msgs/msg/S", HASH, f"std_msgs/Header header\nfloat64 x\nuint8 n{HEADER}")
 NAMES = RosType("/names", "a_msgs/msg/N", HASH, "string[] names\nfloat64[] x")
+HOLES = RosType("/holes", "a_msgs/msg/H", HASH, f"E e\nint8 a\nE[3] f\nint16 b\nE g\n{LINE}MSG: a_msgs/E\n")
 EMPTY = RosType("/empty", "std_msgs/msg/Empty", HASH, "")
 UNKNOWN = RosType("/unknown", "a_msgs/msg/U", HASH, "this is no definition")
-LAYOUTS = {kind.id: kind.layout for kind in (FLAT, STAMPED, NAMES, EMPTY, UNKNOWN)}
+LAYOUTS = {kind.id: kind.layout for kind in (FLAT, STAMPED, NAMES, HOLES, EMPTY, UNKNOWN)}
 
 
 def batch_of(kind: RosType, raws: Sequence[bytes], step_us: int = 1000) -> Batch:
@@ -89,6 +90,19 @@ GAPS = flat().index(b"\x03") + 1
 )  # fmt: skip
 def test_what_is_beside_the_numbers_is_restored(raws: list[bytes]) -> None:
     assert again(FLAT, raws) == CODEC
+
+
+@pytest.mark.parametrize("hole", [0, 7])
+def test_empty_messages_between_numbers_are_restored(hole: int) -> None:
+    raws = [
+        Cdr().put("B", hole).put("b", i).put("B", *[hole] * 3).put("h", -i).put("B", hole).data
+        for i in range(9)
+    ]
+    assert again(HOLES, raws) == CODEC
+    assert decode_batch(encode_batch(batch_of(HOLES, raws))).columns == {
+        "a": list(range(9)),
+        "b": [-i for i in range(9)],
+    }
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
 from contextlib import suppress
 from typing import Any, Callable
 
@@ -275,6 +276,23 @@ def test_nested_types_give_a_bounded_view(length: str, leaf: str, order: str) ->
         # Only an empty message has the length of this definition.
         with pytest.raises(MessageError):
             Decoder(parse("a_msgs/msg/A", definition), select=select).decode(Cdr(order).data + bytes(1000))
+
+
+def test_many_empty_messages_give_a_bounded_plan() -> None:
+    """A definition of a few lines can describe any number of bytes."""
+    empties = "".join(f"E e{i}\n" for i in range(500))
+    definition = f"T[64] t\n{LINE}MSG: a_msgs/T\nint8 x\n{empties}{LINE}MSG: a_msgs/E\n"
+    tracemalloc.start()
+    try:
+        decoder = Decoder(parse("a_msgs/msg/A", definition))
+        assert decoder.decode(Cdr().data + bytes(64 * 501)) == {f"t.{i}.x": 0 for i in range(64)}
+        assert decoder.flat is None
+        deep = "".join(f"T{i}[64] t\n{LINE}MSG: a_msgs/T{i}\n" for i in range(6))
+        with pytest.raises(MessageError, match="too large"):
+            Decoder(parse("a_msgs/msg/A", f"uint8 a\n{deep}"))
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000
+    finally:
+        tracemalloc.stop()
 
 
 @examples(150)
