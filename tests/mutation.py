@@ -23,7 +23,10 @@ ODD: tuple[Any, ...] = (
 # What an attribute of a stored item may be.
 ODD_ATTRIBUTES: tuple[Any, ...] = (
     *({"N": text} for text in ("-1", "0", "1E+125", "9" * 38, "-" + "9" * 30, "0.5", "1E-130", "2", "50001")),
-    *({"S": text} for text in ("", "50", "steps", "ros1", "9" * 16 + "-0badcafe-0", "x" * 4000, "\x00é")),
+    *(
+        {"S": text}
+        for text in ("", "50", "steps", "ros1", "ros2", "9" * 16 + "-0badcafe-0", "x" * 4000, "\x00é")
+    ),
     *({"B": b"50"}, {"BOOL": True}, {"NULL": True}, {"L": [{"N": "2"}]}, {"M": {"a": {"S": "b"}}}),
     *({"SS": ["a"]}, {"NS": ["1"]}),
 )

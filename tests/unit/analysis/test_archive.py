@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zlib
+from functools import partial
 
 import pyarrow.parquet as pq
 import pytest
@@ -25,6 +26,7 @@ from iort_contract.tables import BATCH
 from testkit.dynamodb import TOPIC_OF_CAR, item_of, item_of_message
 from tests.ros1_strategies import definitions, messages
 from tests.unit.contract.contract_values import BOOT, batches, same
+from tests.unit.contract.ros import ros_values
 
 HOUR = Hour(472_222)
 
@@ -48,12 +50,17 @@ def same_columns(one, other):
 
 @st.composite
 def message_batches(draw):
-    """A batch of ROS messages, that may become columns, or that are kept as published."""
-    made = draw(definitions())
-    # A topic for each definition: genmsg's checksum leaves out whether a nested type is an array.
-    topic = f"/made_{zlib.crc32(made.definition.encode())}"
-    kind = RosType(topic, made.kind, made.md5sum, made.definition)
-    raws = draw(st.lists(messages(made) | st.binary(max_size=8), min_size=1, max_size=4))
+    """A batch of messages of ROS 1 or 2, that may become columns, or that are kept as published."""
+    if draw(st.booleans()):
+        made = draw(definitions())
+        # A topic for each definition: genmsg's checksum leaves out whether a nested type is an array.
+        topic = f"/made_{zlib.crc32(made.definition.encode())}"
+        kind, of_kind = RosType(topic, made.kind, made.md5sum, made.definition), messages(made)
+    else:
+        made = draw(ros_values.definitions(ros2=True))
+        kind = RosType("/made", made.kind, "RIHS01_", ros_values.text_of(made))
+        of_kind = ros_values.values(made).map(partial(ros_values.by_rosbags, made))
+    raws = draw(st.lists(of_kind | st.binary(max_size=8), min_size=1, max_size=4))
     first = draw(st.integers(0, 2**50))
     times = [first + i for i in range(len(raws))]
     beside = draw(st.sampled_from([{}, {"place": ["a"] * len(raws)}]))

@@ -33,22 +33,34 @@ from testkit.dynamodb import item_of
 from tests.examples import examples
 from tests.mutation import mutated_bytes, mutated_item, mutated_json, mutated_value
 from tests.unit.contract.ros.ros1_messages import HEADER, header, text
+from tests.unit.contract.ros.ros2_messages import HEADER as ROS2_HEADER
+from tests.unit.contract.ros.ros2_messages import Cdr
 
 T_US, RUN = 1_700_000_000_000_000, "0badcafe"
 FLAT = RosType("/flat", "a_msgs/S", "2", "Header header\nfloat64 x\nuint8 n" + HEADER)
 NAMES = RosType("/names", "a_msgs/N", "3", "string[] names\nuint8[] data\nfloat64[] x")
-LAYOUTS = {FLAT.id: FLAT.layout, NAMES.id: NAMES.layout}
+FLAT_2 = RosType("/flat", "a_msgs/msg/S", "2", "std_msgs/Header header\nfloat64 x\nuint8 n" + ROS2_HEADER)
+NAMES_2 = RosType("/names", "a_msgs/msg/N", "3", "string[] names\nwstring w\nuint8[] data\nfloat64[] x")
+LAYOUTS = {kind.id: kind.layout for kind in (FLAT, NAMES, FLAT_2, NAMES_2)}
 RAWS = [header() + struct.pack("<dB", i / 2, i) for i in range(3)]
 TEXTS = [struct.pack("<I", 2) + text("a") + text("b") + struct.pack("<I", 0) * 2 for _ in range(3)]
+RAWS_2 = [Cdr().header().put("d", i / 2).put("B", i).data for i in range(3)]
+TEXTS_2 = [
+    Cdr(order).put("I", 2).text("a", "b").wide("ab").put("I", 1).put("B", 9).put("I", 0).data
+    for order in "<>>"
+]
 TIMES = [T_US, T_US + 1000, T_US + 2000]
 BATCHES = [
     batch.Batch(RUN, 3, TIMES, {"speed": [1.5, 2.25, 3], "mode": ["a", None, True], "n": [1, 2, 3]}, 1),
     batch.Batch(RUN, 0, TIMES, {"speed": [1.5, 2.25, 3], "volts": [7, 8, 9]}, 0, None, ()),
     batch.Batch(RUN, 4, TIMES, {}, 0, Messages(FLAT.id, FLAT.layout, RAWS)),
     batch.Batch(RUN, 5, TIMES, {"note": ["a", "b", None]}, 0, Messages(NAMES.id, NAMES.layout, TEXTS)),
+    batch.Batch(RUN, 6, TIMES, {}, 0, Messages(FLAT_2.id, FLAT_2.layout, RAWS_2)),
+    batch.Batch(RUN, 7, TIMES, {"note": ["a", "b", None]}, 0, Messages(NAMES_2.id, NAMES_2.layout, TEXTS_2)),
 ]
 ITEMS = list(map(item_of, BATCHES))
 PACKED, ABOUT = as_columns(BATCHES[2].messages, TIMES)
+_, ABOUT_2 = as_columns(BATCHES[4].messages, TIMES)
 COLUMNS = {name: unpacked(name, column, len(TIMES)) for name, column in PACKED.items()}
 DRIVE, ESTIMATE = analysis.DriveKey("car7", T_US, RUN), analysis.Estimate(0.03, 0.02, 0.04, "ohm")
 FINDING = analysis.Finding(
@@ -123,7 +135,8 @@ DECODERS: Mapping[str, Decoder] = {
         lambda body: view(unpack(body, 3)), tuple(pack(one.messages) for one in BATCHES[2:])
     ),
     "ROS columns": of_values(
-        lambda about: from_columns(COLUMNS, json.dumps(about), TIMES, LAYOUTS), (json.loads(ABOUT),)
+        lambda about: from_columns(COLUMNS, json.dumps(about), TIMES, LAYOUTS),
+        (json.loads(ABOUT), json.loads(ABOUT_2)),
     ),
     "ROS message": of_bytes(decoder_of(NAMES.layout).decode, (TEXTS[0],)),
     "ROS message of numbers": of_bytes(decoder_of(FLAT.layout).decode, (RAWS[0],)),
@@ -131,6 +144,12 @@ DECODERS: Mapping[str, Decoder] = {
         lambda text: parse("a_msgs/S", text), "Header header\nfloat64[3] x\nuint8 N=5\n" + HEADER
     ),
     "ROS layout": of_texts(lambda text: decoder_of(text).decode(RAWS[0]), FLAT.layout),
+    "ROS 2 message": of_bytes(decoder_of(NAMES_2.layout).decode, (TEXTS_2[0], TEXTS_2[1])),
+    "ROS 2 message of numbers": of_bytes(decoder_of(FLAT_2.layout).decode, (RAWS_2[0],)),
+    "ROS 2 definition": of_texts(
+        lambda text: parse("a_msgs/msg/S", text), "string<=3[<=5] s\nfloat64 f 1\nint8 N=5\n" + ROS2_HEADER
+    ),
+    "ROS 2 layout": of_texts(lambda text: decoder_of(text).decode(RAWS_2[0]), FLAT_2.layout),
     "message type": of_values(message_type, (MessageType("s", "/s", "a/A", "1", "float64 x").sample(),)),
     # The live lane and the pings.
     "live": of_json(live.decode_live, (live.encode_live(LIVE),)),
