@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from rosbags.convert.converter import STATIC_MSGTYPE_RENAMES, is_same_wireformat, migrate_bytes
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from iort_contract.limits import MessageError
@@ -106,6 +107,9 @@ def _store(types: Any, known: Any = None) -> Any:
 def _converted(kind: MessageType, *, ros2: bool, own: bool) -> Form:
     name = kind.kind.replace("/", "/msg/", 1) if ros2 else kind.kind
     source = _store(get_types_from_msg(_BOUND.sub("", kind.definition), name))
+    every = [field for _, fields in source.fielddefs.values() for _, field in fields]
+    if ros2 and any(node is Nodetype.ARRAY and not array[1] for node, array in every):
+        raise ValueError("it has an array of no elements")
     # The newest of the distributions that robots have: where an older type is shorter, its readers leave out
     # what comes after.
     known = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)

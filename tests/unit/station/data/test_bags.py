@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
 from mcap.reader import make_reader
 from rosbags import rosbag1, rosbag2
 from rosbags.convert.converter import default_message
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from iort_contract.ros.decode import Decoder
+from iort_contract.ros.definition import parse
 from iort_contract.ros.message import ROS2, MessageType
 from iort_station.data import bags
-from iort_station.data.ros_forms import ConversionError
+from iort_station.data.ros_forms import ConversionError, form_of
 from iort_station.errors import StationError
+from testkit.ros1_types import Message
+from tests.unit.station.data.test_export import of_some_definition
 
 LINE = "=" * 80 + "\n"
 T_NS = 1_700_000_000_123_456_789
@@ -214,6 +220,42 @@ def test_a_type_that_only_one_ros_has_goes_by_its_own_definition(tmp_path: Path)
     _, [(schema, _, one)] = of_mcap(tmp_path / "a.mcap")
     assert one.data == want
     assert "uint8 MOST=3" in schema.data.decode()
+
+
+@given(of_some_definition())
+def test_any_message_of_ros_1_has_the_same_fields_in_ros_2_and_back(
+    made: tuple[Message, list[bytes]],
+) -> None:
+    ros1, sent = made
+    assume("[0]" not in ros1.definition)
+    # A byte of ROS 2 has no sign.
+    text = re.sub(r"\bbyte\b", "int8", ros1.definition)
+    kind = MessageType("s", "/t", ros1.kind, "", text)
+    there = form_of(kind, ros2=True)
+    back = form_of(kind._replace(kind=there.kind, definition=there.definition), ros2=False)
+    one = Decoder(parse(ros1.kind, text))
+    two = Decoder(parse(there.kind, there.definition))
+    for raw in sent:
+        fields = one.decode(raw)
+        assert _told(two.decode(there.convert(raw))) == _told(fields)
+        assert _told(one.decode(back.convert(there.convert(raw)))) == _told(fields)
+
+
+def _told(fields: Mapping[str, Any]) -> dict[str, str]:
+    """The fields that both ROS have. Seconds of ROS 2 have a sign; a NaN equals a NaN."""
+    return {
+        name: repr(value % 2**32 if name.endswith("sec") and type(value) is int else value)
+        for name, value in fields.items()
+        if name.rpartition(".")[2] != "seq"
+    }
+
+
+def test_what_ros_2_cannot_have_is_named() -> None:
+    kind = MessageType("s", "/t", "lab_msgs/None", "", "uint8[0] none\n")
+    with pytest.raises(
+        StationError, match=r"lab_msgs/None cannot be .* ROS 2: it has an array of no elements"
+    ):
+        form_of(kind, ros2=True)
 
 
 def test_what_was_converted_when_it_was_recorded_is_converted_back(tmp_path: Path) -> None:
