@@ -24,6 +24,7 @@ from bench.ros.ros2_loads import LARGE, LOADS
 # A second of the fastest topic, and more.
 _DEPTH = 2000
 _BODIES = 97
+_JOIN_S = 60
 
 
 def bodies(kind: str) -> list[bytearray]:
@@ -52,7 +53,10 @@ def main() -> None:
     qos = QoSProfile(depth=_DEPTH)
     publishers = [node.create_publisher(get_message(load.kind), topic, qos) for topic in load.topics]
     prepared, pause = bodies(load.kind), threading.Event()
+    give_up = time.monotonic() + _JOIN_S
     while any(publisher.get_subscription_count() < subscribers for publisher in publishers):
+        if time.monotonic() > give_up:
+            sys.exit(f"no {subscribers} subscribers of every topic within {_JOIN_S} s")
         pause.wait(0.05)
     print("ready", flush=True)
     sys.stdin.readline()

@@ -121,7 +121,7 @@ def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int) ->
             ),
             FLOOR: graph.start("bench.floors.ros2_floor", load.kind, *load.topics),
         }
-        if ros2.has("rosbag2_transport"):
+        if ros2.has("ros2bag"):
             processes[RECORDER] = graph.run(
                 ["ros2", "bag", "record", "-s", "mcap", "-o", str(bag), *load.topics]
             )

@@ -139,7 +139,7 @@ def drive(
     request: pytest.FixtureRequest,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Drive:
-    if not ros2.has("rosbag2_transport"):
+    if not ros2.has("ros2bag"):
         pytest.skip(f"{ros2.distribution} has no `ros2 bag record`: install rosbag2")
     # After the question for ROS 2: it takes a minute.
     cloud: EmbeddedCloud = request.getfixturevalue("embedded")
