@@ -15,6 +15,8 @@ from rosbags.rosbag2 import Reader
 # A killed agent loses its open batches, which are one second long, and on a busy machine what it has not yet
 # read: at most so much.
 OPEN_S, LAG_S = 2.5, 8.0
+# It remembers a latched message once that is surely in its queue; until then, it rather takes it twice.
+UNSETTLED_S = 5.0
 
 
 def whole(data: bytes) -> bytes:
@@ -72,7 +74,8 @@ class Publisher(NamedTuple):
 @dataclass(frozen=True)
 class Row:
     """A topic's account, in messages. ``dead`` were published while no agent was there, ``open`` were in the
-    killed agent's open batches; ``named`` is what the middleware or the audit reports as lost.
+    killed agent's open batches; ``named`` is what the middleware or the audit reports as lost. ``again`` are
+    the latched ones from just before the kill that came twice.
     """
 
     topic: str
@@ -85,13 +88,14 @@ class Row:
     open: int
     named: int
     extra: int
+    again: int
     unrecorded: int
     difference: str = ""
 
     @property
     def unexplained(self) -> int:
         """How many messages are missing without a cause, or were stored without having been published."""
-        return max(0, self.missing - self.dead - self.open - self.named) + self.extra
+        return max(0, self.missing - self.dead - self.open - self.named) + self.extra - self.again
 
     def as_json(self) -> dict[str, Any]:
         return {**asdict(self), "unexplained": self.unexplained}
@@ -111,7 +115,7 @@ class Account(NamedTuple):
     recorded: Contents
     kill: Kill
 
-    def row(self, topic: str, kind: str, publishers: Sequence[Publisher], named: int) -> Row:
+    def row(self, topic: str, kind: str, publishers: Sequence[Publisher], named: int, latched: bool) -> Row:
         """Return a topic's account."""
         sent = Counter(whole(one.data) for publisher in publishers for one in publisher.sent)
         came = Counter(map(whole, self.stored.messages.get(topic, ())))
@@ -119,6 +123,13 @@ class Account(NamedTuple):
         left, extra = sent - came, came - sent
         opened: Counter[bytes] = Counter()
         dead: Counter[bytes] = Counter()
+        since_ns = self.kill.killed_ns - UNSETTLED_S * 1e9
+        unsettled = Counter(
+            whole(one.data)
+            for publisher in publishers
+            for one in publisher.sent
+            if latched and since_ns <= one.t_ns < self.kill.killed_ns
+        )
         for publisher in publishers:
             before, after = _excused(publisher, self.kill, left)
             opened.update(before)
@@ -134,6 +145,7 @@ class Account(NamedTuple):
             open=((left - dead) & opened).total(),
             named=named,
             extra=extra.total(),
+            again=(extra & unsettled).total(),
             unrecorded=(sent - taped).total(),
             difference=_difference(left, extra),
         )
@@ -164,7 +176,18 @@ def _difference(left: Counter[bytes], extra: Counter[bytes]) -> str:
 
 def table(rows: Sequence[Row]) -> str:
     """Return the account as text, with a line for each topic and one for all."""
-    names = ("published", "stored", "recorded", "missing", "dead", "open", "named", "extra", "unexplained")
+    names = (
+        "published",
+        "stored",
+        "recorded",
+        "missing",
+        "dead",
+        "open",
+        "named",
+        "extra",
+        "again",
+        "unexplained",
+    )
     head = ("topic", "type", *names[:2], "in the bag", *names[3:])
     cells = [(r.topic, r.kind, *(f"{getattr(r, name):,}" for name in names)) for r in rows]
     sums = (f"{sum(getattr(r, name) for r in rows):,}" for name in names)

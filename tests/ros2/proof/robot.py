@@ -22,8 +22,9 @@ class Topic(NamedTuple):
     best_effort: bool = False
 
     @property
-    def package(self) -> str:
-        return self.kind.split("/", 1)[0]
+    def settings(self) -> dict[str, str]:
+        """How the agent records it, besides its stream and time."""
+        return {"large": "upload"} if self.lengths.get("data", 0) > 50_000 else {}
 
     @property
     def stream(self) -> str:
@@ -38,6 +39,7 @@ class Command(NamedTuple):
     rate_hz: float
     values: str
     options: tuple[str, ...] = ()
+    settings: Mapping[str, str] = {}
 
     @property
     def latched(self) -> bool:

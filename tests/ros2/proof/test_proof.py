@@ -66,12 +66,17 @@ class Robot:
         self.topics = {one.name: one for one in every if graph.ros2.has(one.kind.split("/", 1)[0])}
         self.absent = [one.name for one in every if one.name not in self.topics]
         topics = {
-            name: {"stream": topic.stream, "time": "header" if self._stamped(topic) else "arrival"}
+            name: {
+                "stream": topic.stream,
+                "time": "header" if self._stamped(topic) else "arrival",
+                **topic.settings,
+            }
             for name, topic in self.topics.items()
         }
         settings = {
             "port": proxy.port,
             "queue": {"path": "spool.db"},
+            "files": {"large_folder": "large", "large_every_s": 0, "rate_kb_s": 0},
             "sources": [{"type": "ros2", "topics": topics}],
         }
         self.bundle = robots.add(cloud.cloud, self.out.name, out=self.out, settings=settings)
@@ -205,7 +210,7 @@ def _driven(robot: Robot) -> Drive:
     published, kill = _published(robot, publishers, first, commands, killed_ns)
     account = Account(stored, recorded, kill)
     rows = [
-        account.row(name, topic.kind, published[name], named(audit, topic.stream, name))
+        account.row(name, topic.kind, published[name], named(audit, topic.stream, name), topic.latched)
         for name, topic in robot.topics.items()
     ]
     others = [name for name in stored.kinds if stored.kinds[name][0] != recorded.kinds[name][0]]
