@@ -33,7 +33,7 @@ ATTACHMENT_FIELDS = {
     "content_type": "the content's type",
     "thumbnail": "of an image: base64 of a small JPEG",
 }
-# The place of the content in the serialized message, which has an empty array there.
+# The place of the content in the serialized message: an empty array there, or in ROS 2 one of up to 7 bytes.
 ATTACHMENT_AT = "at"
 
 _FILE_LEVEL = r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}"
