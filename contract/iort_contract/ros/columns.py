@@ -101,7 +101,8 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
     if not messages.readable:
         return None
     decoder = decoder_of(messages.layout)
-    numbers = _numbers(decoder, messages.raw)
+    # Most messages whose numbers are no steps show it at once.
+    numbers = _numbers(decoder, messages.raw) if _steps(decoder, messages.raw[-1]) else None
     if numbers is None or max(map(len, numbers.names)) > MAX_FIELD_CHARACTERS:
         return None
     columns: dict[str, list[Value]] = {}
@@ -122,6 +123,15 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
         return None
     heads = _about_heads(decoder, messages.raw, numbers.starts, times_us) if decoder.stamped else []
     return None if heads is None else (written, COMPACT.encode([*about, *heads]))
+
+
+def _steps(decoder: Decoder, raw: bytes) -> bool:
+    """Whether each number of a message could be one of a column of steps."""
+    numbers = _numbers(decoder, [raw])
+    if numbers is None:
+        return False
+    values = set(numbers.readers[0].unpack_from(numbers.bodies[0]))
+    return all(packed([value])[0] is not None for value in values if type(value) is float and value == value)  # noqa: PLR0124 - no NaN
 
 
 def _about_heads(

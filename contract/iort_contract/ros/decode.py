@@ -128,7 +128,8 @@ class Decoder:
             self._body = self._compiled.parts(name)
         else:
             self._body = self._compiled.compile(body) if self.stamped else self._compiled.parts(name)
-        self.unknown = sorted(path for path in select or () if not self._has(path.split("."), body))
+        self._fields = body
+        self.unknown = sorted(path for path in select or () if not self.has(path))
         self.flat: Run | None = None
         if len(self._body) == 1 and isinstance(self._body[0], Run) and self._body[0].numbers <= MAX_FIELDS:
             self.flat = self._body[0] if self._body[0].named("")[1] else None
@@ -293,8 +294,11 @@ class Decoder:
             self._chosen[path] = any(path == name or path.startswith(f"{name}.") for name in self._select)
         return self._chosen[path]
 
-    def _has(self, parts: Sequence[str], fields: Fields) -> bool:
+    def has(self, path: str) -> bool:
         """Whether a path can be in the messages."""
+        return self._has(path.split("."), self._fields)
+
+    def _has(self, parts: Sequence[str], fields: Fields) -> bool:
         field = next((field for field in fields if field.name == parts[0]), None)
         rest = parts[1:]
         if field is None or not rest:

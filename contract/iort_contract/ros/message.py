@@ -39,6 +39,7 @@ class RosType:
         self.decoder: Decoder | None = None
         self.layout = kind if self.ros2 else ""
         self.error = ""
+        self._known: dict[str, bool] = {}
         try:
             parsed = parse(kind, definition)
             written = f"{kind}\n{layout(parsed)}"
@@ -49,6 +50,13 @@ class RosType:
                 self.error = f"{kind}: layout must be at most {MAX_LAYOUT} characters"
         except MessageError as error:
             self.error = str(error)
+
+    def has(self, name: str) -> bool:
+        """Whether a field can be in the messages' samples."""
+        known = self._known.get(name)
+        if known is None:
+            known = self._known[name] = self.decoder is not None and self.decoder.has(name)
+        return known
 
 
 class RosMessage(Mapping[str, Value]):
@@ -86,6 +94,9 @@ class RosMessage(Mapping[str, Value]):
     # `Mapping` has these, too, in steps for each field: half of what a live message takes.
 
     def get(self, name: str, default: Any = None) -> Any:
+        # Nobody decodes a message to learn that it has no fault code.
+        if self._values is None and name not in self.beside and not self.kind.has(name):
+            return default
         return self._sample().get(name, default)
 
     def values(self) -> ValuesView[Value]:

@@ -13,6 +13,7 @@ import functools
 import importlib
 import logging
 import sys
+import time
 from typing import Any, Callable, Mapping, Sequence
 
 from iort_agent.common.threads import brief
@@ -24,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 # A topic that is faster than the agent must let the others have their turn.
 _AT_ONCE = 64
+# Messages that come closer together are fetched together a little later: waking costs more than they do.
+_BUSY_S, _PAUSE_S = 0.002, 0.004
 _PIECES = (
     "add_event", "add_guard_condition", "add_service", "add_subscription", "clear_entities",
     "get_ready_entities", "wait",
@@ -256,6 +259,7 @@ class _WaitSet:
     def __init__(self, session: RclpySession) -> None:
         self._session = session
         self._rclpy = _implementation()
+        self._busy = False
         self.change()
 
     @staticmethod
@@ -288,7 +292,11 @@ class _WaitSet:
         for service in self._services.values():
             wait_set.add_service(service.handle)
         wait_set.add_guard_condition(self._session.guard.handle)
+        if self._busy:
+            time.sleep(_PAUSE_S)
+        began = time.monotonic()
         wait_set.wait(int(timeout_s * 1e9))
+        self._busy = time.monotonic() - began < _BUSY_S
         for pointer in wait_set.get_ready_entities("subscription"):
             self._subscriptions[pointer].take_some()
         if self._services:
