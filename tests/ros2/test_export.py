@@ -97,7 +97,9 @@ def info(graph: Graph, path: Path) -> list[str]:
 
 
 def play(graph: Graph, path: Path, *options: object) -> Process:
-    return graph.command("bag", "play", path, "--delay", 3, "--disable-keyboard-controls", *options)
+    # The player ends with its last message, and takes it along unless it waits.
+    waits = ("--delay", 3, "--wait-for-all-acked", 10_000)
+    return graph.command("bag", "play", path, "--disable-keyboard-controls", *waits, *options)
 
 
 @pytest.mark.parametrize("ending", [".mcap", ""])
