@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Iterator, Mapping
 
 from iort_agent.common.schema import choice, section, setting, text
@@ -17,11 +18,17 @@ from iort_agent.errors import SourceError
 from iort_agent.ros.qos import QosConfig
 from iort_agent.ros.ros2_node import DEFAULT_NODE, shared
 from iort_agent.ros.ros2_types import rclpy
-from iort_agent.sources import FAIL, OK, Finding, ros
+from iort_agent.sources import FAIL, OK, WARN, Finding, ros
 from iort_agent.sources.intake import ARRIVAL, HEADER, SOURCE, Intake
 from iort_agent.sources.ros import RosConfig, RosSource, node_name, topics_rule
 
 # What chooses the part of the network in which robots find each other: until Humble, and since Iron.
+# With any of these, Fast DDS need not share memory.
+_TRANSPORTS = (
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+)
 _RANGES = ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE")
 
 
@@ -57,7 +64,7 @@ class Ros2Config(RosConfig):
         """Whether rclpy is there, and which graph it would join."""
         python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
         try:
-            middleware = rclpy().get_rmw_implementation_identifier()
+            name = middleware()
         except SourceError as error:
             todo = (
                 "source /opt/ros/<distribution>/setup.bash, in an environment of that distribution's Python"
@@ -70,8 +77,23 @@ class Ros2Config(RosConfig):
         distribution = os.environ.get("ROS_DISTRO", "of no name")
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         ranges = [f"{name}={os.environ[name]}" for name in _RANGES if os.environ.get(name)]
-        found = [f"ROS 2 {distribution}", python, str(middleware), f"domain {domain}", *ranges]
+        found = [f"ROS 2 {distribution}", python, name, f"domain {domain}", *ranges]
         yield Finding(title, OK, ", ".join(found))
+        if name.startswith("rmw_fastrtps") and not any(map(os.environ.get, _TRANSPORTS)) and _others():
+            todo = "run the agent as that user, or (since Jazzy) with FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
+            why = "Fast DDS shares memory within one user alone, and another user's nodes are here"
+            yield Finding(title, WARN, f"{why}: their topics may be listed and bring no message", todo)
+
+
+def middleware() -> str:
+    """The name of the middleware that the agent would use. Raises `SourceError` without rclpy, and rclpy's
+    errors."""
+    return str(rclpy().get_rmw_implementation_identifier())
+
+
+def _others(shared_memory: Path = Path("/dev/shm")) -> bool:  # noqa: S108 - Linux' name for it
+    """Whether another user's nodes have memory of Fast DDS."""
+    return any(file.stat().st_uid != os.getuid() for file in shared_memory.glob("fastrtps_port*"))
 
 
 class Ros2Source(RosSource):

@@ -19,10 +19,18 @@ from iort_agent.errors import IdentityError, NotRunningError
 from iort_agent.identity import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import FAIL, OK, WARN, Finding
+from iort_agent.sources.ros1 import Ros1Config
+from iort_agent.sources.ros2 import Ros2Config, middleware
 from iort_agent.status import ask
 from iort_agent.verbs.connectivity import check_connection
 from iort_contract.messages.commands import NO_MOTION
 
+_NOT_YET = "not yet"
+_MIDDLEWARES = {
+    "rmw_fastrtps_cpp": "Fast DDS",
+    "rmw_cyclonedds_cpp": "Cyclone DDS",
+    "rmw_zenoh_cpp": "Zenoh",
+}
 _EXPIRES_SOON_S = 30 * 86_400
 _LEAST_FREE_BYTES = 50_000_000
 
@@ -37,6 +45,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     yield from _queue(config)
     yield _lanes(config)
     yield emergency_stop(config)
+    yield from rows(config, running)
     if running is None:
         yield Finding("agent", OK, "not running")
     else:
@@ -116,6 +125,29 @@ def emergency_stop(config: Config) -> Finding:
         todo = "give downlink.cmd a command with motion, or whoever can stop the robot another way"
         return Finding("emergency stop", WARN, f"does nothing here: {NO_MOTION}", todo)
     return Finding("emergency stop", OK, f"ends what {', '.join(commands)} moves")
+
+
+def rows(config: Config, running: Status | None) -> Iterator[Finding]:
+    """The robot's row in the table of docs/how-to/ros2.md, with what its running agent has seen."""
+    for i, source in enumerate(config.sources):
+        if isinstance(source, Ros2Config):
+            try:
+                name = middleware()
+            except Exception:  # noqa: BLE001, S112 - the source's own check has said it
+                continue
+            robot = [os.environ.get("ROS_DISTRO", "ROS 2").capitalize(), _MIDDLEWARES.get(name, name)]
+        elif isinstance(source, Ros1Config):
+            robot = [os.environ.get("ROS_DISTRO", "ROS 1").capitalize(), "TCPROS"]
+        else:
+            continue
+        counts = running.sources[i] if running is not None and i < len(running.sources) else {}
+        topics = [topic["messages"] for topic in counts.values() if isinstance(topic, dict)]
+        heard = f"{sum(map(bool, topics))} topics, {sum(topics):,} messages" if any(topics) else _NOT_YET
+        downlink = (running.downlink if running is not None else None) or {}
+        commands = sum(command["passed"] for command in downlink.get("commands", {}).values())
+        peers = sum(sum(robots.values()) for robots in downlink.get("fleet", {}).values())
+        passed = f"{commands:,} commands, {peers:,} of peers" if commands or peers else _NOT_YET
+        yield Finding("row", OK, f"| {' | '.join([*robot, heard, passed])} |")
 
 
 def _lanes(config: Config) -> Finding:
