@@ -19,9 +19,10 @@ from iort_agent.common.schema import read_yaml
 from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.mqtt.rate_limiter import BYTES_PER_S
-from iort_agent.sources import UPLOAD
+from iort_agent.sources import OK, UPLOAD
 from iort_agent.sources.intake import ARRIVAL, HEADER
 from iort_agent.sources.ros import matches, ros_name, stream_of
+from iort_agent.sources.ros2 import Ros2Config
 from iort_agent.verbs.survey import (
     LARGE,
     LOOK_S,
@@ -77,7 +78,7 @@ class Line(NamedTuple):
         topic = self.topic
         if not topic.messages:
             return "silent" if topic.published else "nobody publishes it"
-        rate = "once" if topic.rate_hz is None else f"{topic.rate_hz:.4g} Hz"
+        rate = "once" if topic.rate_hz is None else f"{topic.rate_hz:.3g} Hz"
         return f"{rate}, {topic.size:,} bytes"
 
 
@@ -226,21 +227,26 @@ def init(out: Path, *, every: bool, wanted: Sequence[str], listen_s: float, seam
         finally:
             node.close()
     # A machine may have both ROS: the one with more topics is the robot's.
-    graph = max(found, key=lambda ros: len(ros.topics), default=None)
+    graph = max(found, key=lambda ros: sum(not _OWN.fullmatch(one.name) for one in ros.topics), default=None)
     vescs = [poll.end(min(_POLL_S, listen_s)) for poll in polls]
     taken: set[str] = set()
     lines = plan(graph, every=every, wanted=wanted, taken=taken)
-    for row in [*table(lines), *(f"{vesc.port}: {vesc.why or 'a VESC answers'}" for vesc in vescs)]:
-        print(row)
+    rows = [*table(lines), *(f"{vesc.port}: {vesc.why or 'a VESC answers'}" for vesc in vescs)]
     version, title = (graph.version, graph.title) if graph is not None and lines else (0, "")
     section = sources(title, version, lines, vescs, taken)
     if not section:
+        print("\n".join(rows))
         raise SourceError("; ".join(["nothing to record", *reasons]))
     if any(line.large and not line.left_out for line in lines):
         section += _files(out)
     text = f"{_ALONE}\n{section}" if target == out else beside(out, section, version)
     with target.open("x", encoding="utf-8") as file:
         file.write(text)
+    print("\n".join(rows))
+    if version == 2 and not any(line.topic.messages for line in lines):
+        # Perhaps none comes, whatever is published.
+        why = [one for one in Ros2Config(topics=()).check("") if one.level != OK]
+        print("no message came", *(f"{one.text}: {one.todo}" for one in why), sep="; ", file=sys.stderr)
     return target
 
 

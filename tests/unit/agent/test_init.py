@@ -229,7 +229,9 @@ def test_a_pattern_without_a_topic_is_an_error_and_nothing_is_written(robot: Rob
     assert not robot.out.exists()
 
 
-def test_what_nobody_publishes_or_of_several_types_or_not_sourced_is_left_out(tmp_path: Path) -> None:
+def test_what_nobody_publishes_or_of_several_types_or_not_sourced_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     clock = ManualClock()
     silent = ("std_msgs/Bool", "", None)
     node = FakeNode(clock, {"/a": ("a/msg/A", "", None), "/b": silent, "/d": silent})
@@ -240,6 +242,7 @@ def test_what_nobody_publishes_or_of_several_types_or_not_sourced_is_left_out(tm
     assert "; its package is not sourced here\n" in text
     assert "    # /c: {stream: c, time: arrival}  # std_msgs/Bool, nobody publishes it; nobody" in text
     assert "; several types: a/msg/A, b/msg/B\n" in text
+    assert "no message came" in capsys.readouterr().err
 
 
 def test_names_of_streams_are_free_and_valid(tmp_path: Path) -> None:
