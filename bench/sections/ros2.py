@@ -210,8 +210,8 @@ def _arrived(heard: list[tuple[str, bytes]], streams: set[str]) -> int:
     numbers, samples = set[tuple[str, str, int]](), 0
     for whole, payload in heard:
         # By Basic Ingest a topic has the rule before it.
-        name = parse_topic(whole.split("/", 3)[-1] if whole.startswith(_BASIC_INGEST) else whole).name
-        if name not in streams:
+        topic = parse_topic(whole.split("/", 3)[-1] if whole.startswith(_BASIC_INGEST) else whole)
+        if (name := topic.name) not in streams or topic.lane != RECORD:
             continue
         batch = decode_batch(payload)
         if (name, batch.boot, batch.seq) not in numbers:
