@@ -8,7 +8,7 @@ SingleThreadedExecutor, and counts them.
 - the processor time a message, at 1000 Hz, at 50 topics of 20 Hz, which come together or evenly, and at
   30 Hz of 100 KB;
 - the messages lost, by the publisher's own count;
-- the time from ROS publish to an MQTT subscriber over the live lane, beside the bare subscriber's arrival.
+- the time from ROS publish to the broker over the live lane, beside the bare subscriber's arrival.
 
 Without ROS 2 or mosquitto the section has no figures and says why.
 """
@@ -16,18 +16,22 @@ Without ROS 2 or mosquitto the section has no figures and says why.
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from bench.floors import mosquitto
 from bench.floors.mosquitto import ROBOT, Mosquitto, subscribed
+from bench.floors.raw_mqtt import RawClient
 from bench.report import NOT_MEASURED, Report, Section
 from bench.ros.ros2_loads import BIG, FAST, LIVE, LOADS, MANY, SPREAD, Load
 from bench.sections import Declared, Option
@@ -50,6 +54,7 @@ CPU_TIMES, LATER_MS = 1.0, 1.0
 _MIDDLEWARES = ("rmw_fastrtps_cpp", "rmw_cyclonedds_cpp", "rmw_zenoh_cpp")
 _WARM_UP_S, _CATCH_UP_S, _END_S = 3, 60.0, 60.0
 _BASIC_INGEST = "$aws/rules/"
+_WATCHER, _TRIPS = "watcher", 50
 _NONE = machine.Threads()
 
 
@@ -80,7 +85,7 @@ def run(_target: Target | None, say: Say, *, messages: int, duration: int) -> Se
     if program is None:
         section.notes.append("Not measured here: mosquitto is not installed (apt install mosquitto).")
         return section
-    runs, live = list[Run](), dict[str, tuple[Spread, Spread]]()
+    runs, live = list[Run](), dict[str, tuple[Spread, Spread, float]]()
     for middleware in [one for one in _MIDDLEWARES if one in ros2.middlewares()]:
         for name in (FAST, MANY, SPREAD, BIG):
             load = LOADS[name]
@@ -167,7 +172,15 @@ def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int) ->
 
 
 def _threads(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, dict[str, machine.Threads]]:
-    return {who: machine.threads_of(one.pid) for who, one in processes.items()}
+    """What each process' threads have taken; those that Fast DDS names by a port are one."""
+    used: dict[str, dict[str, machine.Threads]] = {}
+    for who, process in processes.items():
+        used[who] = {}
+        for name, now in machine.threads_of(process.pid).items():
+            short = re.sub(r"[.\d]+$", "", name)
+            before = used[who].get(short, _NONE)
+            used[who][short] = machine.Threads(before.cpu_s + now.cpu_s, before.waits + now.waits)
+    return used
 
 
 def _await_received(socket: Path, streams: set[str], count: int) -> None:
@@ -220,22 +233,30 @@ def _arrived(heard: list[tuple[str, bytes]], streams: set[str]) -> int:
     return samples
 
 
-def _delays(program: str, ros2: Ros2, middleware: str, seconds: int) -> tuple[Spread, Spread]:
-    """From ROS publish to an MQTT subscriber by way of the agent, and to the bare subscriber beside it."""
+def _delays(program: str, ros2: Ros2, middleware: str, seconds: int) -> tuple[Spread, Spread, float]:
+    """From ROS publish to a bare MQTT subscriber by way of the agent, and to the bare ROS subscriber beside
+    it; and how long the broker takes to the MQTT subscriber, which is half of its round trip, in ms."""
     load, agent_ms = LOADS[LIVE], list[float]()
     stream = load.topics[0][1:]
-    # A live message goes one way or the other; unlike AWS IoT, mosquitto delivers both.
-    lanes = (build_topic(LIVE_LANE, ROBOT, stream), live_topic(ROBOT, stream))
-
-    def take(_topic: str, payload: bytes) -> None:
-        agent_ms.append(time.time_ns() / 1e6 - decode_live(payload).t_us / 1e3)
-
     with (
         tempfile.TemporaryDirectory() as path,
         Mosquitto(program, Path(path)) as broker,
-        subscribed(broker, lanes, take),
         Ros2Graph(ros2, Path(path), middleware) as graph,
+        RawClient(_watcher(broker, Path(path) / _WATCHER)) as watcher,
     ):
+        watcher.subscribe(_WATCHER)
+        trips_ms = [watcher.round_trip(_WATCHER, bytes(300)) * 1e3 for _ in range(_TRIPS)]
+        # A live message goes one way or the other; unlike AWS IoT, mosquitto delivers both.
+        for lane in (build_topic(LIVE_LANE, ROBOT, stream), live_topic(ROBOT, stream)):
+            watcher.subscribe(lane)
+
+        def watch() -> None:
+            with suppress(OSError, InstrumentError, IndexError):  # the end
+                while True:
+                    _, payload = watcher.receive()
+                    agent_ms.append(time.time_ns() / 1e6 - decode_live(payload).t_us / 1e3)
+
+        threading.Thread(target=watch, daemon=True).start()
         delays = Path(path) / "delays.json"
         graph.start("iort_agent.cli", "run", "--config", broker.car(_topics(load), "ros2"))
         floor = graph.start("bench.floors.ros2_floor", load.kind, *load.topics, "--delays", delays)
@@ -247,39 +268,62 @@ def _delays(program: str, ros2: Ros2, middleware: str, seconds: int) -> tuple[Sp
         publisher.finish()
         _counted(floor)
         floor_ms = json.loads(delays.read_text())
-    return Spread.of(agent_ms[warm:]), Spread.of(floor_ms[load.rate_hz * _WARM_UP_S :])
+    ours, bare = Spread.of(agent_ms[warm:]), Spread.of(floor_ms[load.rate_hz * _WARM_UP_S :])
+    return ours, bare, median(trips_ms) / 2
 
 
-def report(section: Section, runs: list[Run], live: dict[str, tuple[Spread, Spread]]) -> None:
+def _watcher(broker: Mosquitto, folder: Path) -> Path:
+    """The folder of a client that is no robot."""
+    folder.mkdir()
+    certificate, key = broker.identity(_WATCHER)
+    settings = {
+        "robot": _WATCHER,
+        "endpoint": mosquitto.HOST,
+        "port": broker.port,
+        "certificate": str(certificate),
+        "private_key": str(key),
+        "root_ca": str(broker.ca),
+    }
+    (folder / "car.yaml").write_text(json.dumps(settings))
+    return folder
+
+
+def report(section: Section, runs: list[Run], live: dict[str, tuple[Spread, Spread, float]]) -> None:
     """Add the tables and the ratios."""
     order, rows = (AGENT, FLOOR, RECORDER), []
     for one in runs:
+        cells = [LOADS[one.load].title, one.middleware, f"{one.messages:,}"]
+        for values, unit in ((one.cpu_us, " us"), (one.lost, ""), (one.rss_mb, " MB")):
+            cells += [f"{values[who]:,.0f}{unit}" if who in values else NOT_MEASURED for who in order]
+        rows.append(cells)
         title = f"{LOADS[one.load].title}, {one.middleware}"
-        for figure, values in (
-            (f"processor a message, {title}", {who: f"{us:.0f} us" for who, us in one.cpu_us.items()}),
-            (f"memory, {title}", {who: f"{mb:.0f} MB" for who, mb in one.rss_mb.items()}),
-            (f"lost, {title}", {who: f"{lost:,} of {one.messages:,}" for who, lost in one.lost.items()}),
-        ):
-            rows.append([figure, *(values.get(who, NOT_MEASURED) for who in order)])
         for who, most in ((FLOOR, None if one.load == BIG else CPU_TIMES), (RECORDER, None)):
             if who in one.cpu_us:
                 name = f"{title}: the agent's processor / {who}'s"
                 section.ratio(name, one.cpu_us[AGENT] / one.cpu_us[who], most)
-        section.ratio(
-            f"{title}: messages that the agent lost", one.lost[AGENT], 0, unit=f"of {one.messages:,}"
-        )
-    for middleware, (agent_ms, floor_ms) in live.items():
-        title = f"{LOADS[LIVE].title}, {middleware}"
-        rows.append(
-            [f"ROS publish to MQTT subscriber, and arrival: {title}", agent_ms.text(2), floor_ms.text(2), ""]
-        )
+        lost = f"{title}: messages that the agent lost"
+        section.ratio(lost, one.lost[AGENT], 0, unit=f"of {one.messages:,}")
+    figures = [f"{figure}: {who}" for figure in ("processor a message", "lost", "memory") for who in order]
+    section.table(
+        "The agent, and who hears the same beside it", ["load", "middleware", "messages", *figures], rows
+    )
+    rows = []
+    for middleware, (agent_ms, floor_ms, hop_ms) in live.items():
+        rows.append([middleware, agent_ms.text(2), f"{hop_ms:.2f} ms", floor_ms.text(2)])
         if agent_ms.p50 and floor_ms.p50:
-            name = f"{title}: ROS publish to MQTT subscriber, later than the bare subscriber (p50)"
-            section.ratio(name, agent_ms.p50 - floor_ms.p50, LATER_MS, unit="ms", tolerance=3)
-    section.table("The agent", ["figure", *order], rows)
+            name = (
+                f"{LOADS[LIVE].title}, {middleware}: ROS publish to broker, after the bare subscriber (p50)"
+            )
+            later_ms = agent_ms.p50 - hop_ms - floor_ms.p50
+            section.ratio(name, later_ms, LATER_MS, unit="ms", tolerance=3)
+    section.table(
+        f"From ROS publish, {LOADS[LIVE].title}",
+        ["middleware", "to a bare MQTT subscriber", "of it from the broker", f"to the {FLOOR}"],
+        rows,
+    )
     names = {name: None for one in runs for name in one.threads}
     section.table(
-        "Its threads: us a message, wake-ups a second",
+        "The agent's threads: us a message, wake-ups a second",
         ["thread", *(f"{LOADS[one.load].title}, {one.middleware}" for one in runs)],
         [
             [name, *("{:.1f}, {:.0f}".format(*one.threads.get(name, (0, 0))) for one in runs)]
@@ -288,7 +332,7 @@ def report(section: Section, runs: list[Run], live: dict[str, tuple[Spread, Spre
     )
     section.raw = {
         "runs": [asdict(one) for one in runs],
-        "live_ms": {name: [asdict(spread) for spread in spreads] for name, spreads in live.items()},
+        "live_ms": {name: [asdict(ours), asdict(bare), hop] for name, (ours, bare, hop) in live.items()},
     }
 
 
