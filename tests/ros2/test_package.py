@@ -96,7 +96,7 @@ def test_ros2_run_starts_the_agent_with_its_parameters(installed: Graph, tmp_pat
 def test_ros2_launch_starts_the_agent_by_its_arguments(installed: Graph, tmp_path: Path) -> None:
     config = configuration(tmp_path, SOURCE)
     odometry(installed)
-    arguments = (f"config:={config}", "node_name:=recorder", "namespace:=lab", "log_level:=debug")
+    arguments = (f"config:={config}", "node_name:=recorder", "namespace:=lab")
     agent = Agent(installed.command("launch", "iort_agent", "agent.launch.py", *arguments), tmp_path)
     until(lambda: agent.samples("odom") > 5, within_s=WAIT_S)
     assert "/lab/recorder" in nodes(installed)

@@ -109,4 +109,4 @@ def _in_file(file: Path, node: str) -> Iterator[tuple[str, str]]:
     for name, section in content.items() if isinstance(content, dict) else ():
         values: Any = section.get("ros__parameters") if isinstance(section, dict) else None
         if str(name).rpartition("/")[2] in (node, "*", "**") and isinstance(values, dict):
-            yield from ((key, str(values[key])) for key in (CONFIG, LOG_LEVEL) if key in values)
+            yield from ((key, str(values[key])) for key in (CONFIG, LOG_LEVEL) if values.get(key) is not None)
