@@ -1,7 +1,18 @@
 """From the broker to real ROS 2 topics: what tests/ros/test_downlink.py holds over ROS 1 holds here, too."""
 
+from __future__ import annotations
+
+import functools
+import signal
+
+from tests.ros.process import Process
 from tests.ros.test_downlink import (  # noqa: F401 - collected here, with the graph of this folder
+    TWIST,
+    connected,
+    drive,
     driven,
+    has,
+    heard,
     test_a_command_is_not_kept_for_a_late_subscriber,
     test_a_command_is_published_and_its_lease_ends_in_stops,
     test_a_guard_that_dies_is_started_again_and_nothing_moves_meanwhile,
@@ -12,3 +23,22 @@ from tests.ros.test_downlink import (  # noqa: F401 - collected here, with the g
     test_an_invalid_message_is_rejected,
     test_another_robots_pose_appears_as_a_topic,
 )
+from tests.ros2.conftest import Graph
+
+
+def test_a_frozen_subscriber_delays_no_command_and_no_stop(
+    graph: Graph,
+    driven: tuple[Process, Process],  # noqa: F811 - the fixture
+) -> None:
+    downlink, listener = driven
+    frozen = graph.listener("frozen", "/cmd_vel", TWIST[2])
+    connected(downlink, count=2)
+    frozen.signal(signal.SIGSTOP)
+    # More than the middleware keeps for it.
+    for i in range(1, 101):
+        drive(downlink, i, 1_000)
+        listener.until(functools.partial(has, listener, i), f"command {i}")
+    listener.until(functools.partial(has, listener, 0), "stop")
+    times = {message["twist"]["linear"]["x"]: at for at, message in reversed(heard(listener))}
+    assert 0.5 < times[0] - times[100] < 1.5
+    frozen.signal(signal.SIGCONT)
