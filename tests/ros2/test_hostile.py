@@ -28,9 +28,17 @@ MALFORMED = {
     "a text beyond the end": _CDR + struct.pack("<iII", 1, 0, 2**31) + GOOD[20:],
     "a text of 4 GB": _CDR + struct.pack("<iII", 1, 0, 2**32 - 1) + GOOD[20:],
     "of another type": _CDR + struct.pack("<6d", *range(6)),
+}
+# Cyclone DDS drops their packets, and sends them again for ever: nobody hears the topic any more.
+OF_NO_ENCODING = {
     "an unknown encoding": b"\x00\x63\x00\x00" + GOOD[4:],
     "random": bytes((i * 7919 + i * i) & 0xFF for i in range(500)),
 }
+
+
+def malformed(graph: Graph) -> list[bytes]:
+    cyclone = graph.environment.get("RMW_IMPLEMENTATION") == "rmw_cyclonedds_cpp"
+    return [*MALFORMED.values(), *(() if cyclone else OF_NO_ENCODING.values())]
 
 
 class Raw:
@@ -69,29 +77,31 @@ def test_malformed_messages_are_counted_and_others_read(graph: Graph) -> None:
     raw = Raw(graph, imu=IMU, good=FLOAT)
     raw.ready()
     raw.send("/imu", GOOD)
-    for content in MALFORMED.values():
+    for content in malformed(graph):
         raw.send("/imu", content)
         raw.send("/good", _CDR + struct.pack("<d", 1.5))
     raw.send("/imu", GOOD)
     collector.until(lambda: len(samples(collector, "imu")) == 2, "both good messages")
-    collector.until(lambda: len(samples(collector, "good")) == len(MALFORMED), "the other topic's messages")
+    collector.until(
+        lambda: len(samples(collector, "good")) == len(malformed(graph)), "the other topic's messages"
+    )
     report = json.loads(collector.quit()[-1])
     assert [one[2] for one in samples(collector, "imu")] == [{"linear_acceleration.x": 25.0}] * 2
-    assert report["/imu"]["malformed"] + raw.refused() == len(MALFORMED)
-    assert report["/imu"]["messages"] + raw.refused() == len(MALFORMED) + 2
+    assert report["/imu"]["malformed"] + raw.refused() == len(malformed(graph))
+    assert report["/imu"]["messages"] + raw.refused() == len(malformed(graph)) + 2
 
 
 def test_whole_messages_are_kept_as_they_came(graph: Graph) -> None:
     collector = graph.collector({"/imu": {"stream": "imu", "time": "header"}})
     raw = Raw(graph, imu=IMU)
     raw.ready()
-    for content in [GOOD, *MALFORMED.values(), GOOD]:
+    for content in [GOOD, *malformed(graph), GOOD]:
         raw.send("/imu", content)
-    count = 2 + len(MALFORMED) - raw.refused()
+    count = 2 + len(malformed(graph)) - raw.refused()
     collector.until(lambda: len(samples(collector, "imu")) == count, "every message")
     kept = [base64.b64decode(one[3]) for one in samples(collector, "imu")]
     assert kept[0] == kept[-1] == GOOD
-    assert set(kept) <= {whole(content) for content in (GOOD, *MALFORMED.values())}
+    assert set(kept) <= {whole(content) for content in (GOOD, *malformed(graph))}
 
 
 def test_messages_of_ten_megabytes_disturb_no_other_topic(graph: Graph) -> None:
