@@ -125,7 +125,7 @@ class Node:
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages, of any type, in the node's thread."""
 
-        def take(header: Mapping[str, str], data: bytes, _source_ns: int) -> None:
+        def take(header: Mapping[str, str], data: bytes, _source_ns: int, _received_ns: int) -> None:
             handler(header, data)
 
         self._takers[topic, handler] = take

@@ -33,8 +33,8 @@ _CONNECT = 3
 _NOT_INSTALLED, _DIFFERS, _REFUSED = "type_not_installed", "definition_differs", "refused_by_middleware"
 
 # Takes a message: what a ROS 1 publisher's connection header has, its bytes, and the nanoseconds since the
-# epoch at which it was published, 0 if nobody tells.
-OnMessage = Callable[[Mapping[str, str], bytes, int], None]
+# epoch at which it was published and received, 0 if nobody tells.
+OnMessage = Callable[[Mapping[str, str], bytes, int, int], None]
 
 
 class _Part:
@@ -181,9 +181,9 @@ class Topic:
                 if key in both:
                     return
                 both.add(key)
-            header = part.header
+            header, received_ns = part.header, info.get("received_timestamp", 0)
             for taker in self.takers:
-                taker(header, data, source_ns)
+                taker(header, data, source_ns, received_ns)
 
         def told(reason: str, many: int) -> None:
             if reason == INCOMPATIBLE:

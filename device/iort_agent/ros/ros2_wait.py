@@ -27,6 +27,8 @@ _log = logging.getLogger(__name__)
 _AT_ONCE = 64
 # Messages that come closer together are fetched together a little later: waking costs more than they do.
 _BUSY_S, _PAUSE_S = 0.002, 0.004
+# How long each of several executors waits in turn.
+_TURN_S = 0.01
 _PIECES = (
     "add_event", "add_guard_condition", "add_service", "add_subscription", "clear_entities",
     "get_ready_entities", "wait",
@@ -35,25 +37,45 @@ _RELIABLE, _TRANSIENT_LOCAL = 1, 1
 _WATCHED = {"message_lost": LOST, "incompatible_qos": INCOMPATIBLE}
 
 
-class RclpySession:
-    """The session of a node of rclpy, in a context of its own: the agent has its own handlers of signals.
+class _Member:
+    """A node of rclpy in a context of its own: the agent has its own handlers of signals.
 
-    Its attributes are for the parts of this module.
+    ``kinds`` are the types of its topics: Fast DDS allows a participant only one type of a topic.
     """
 
-    def __init__(self, name: str) -> None:
-        self.context = importlib.import_module("rclpy.context").Context()
+    def __init__(self, name: str, arguments: Sequence[str], namespace: str | None = None) -> None:
+        self.context: Any = importlib.import_module("rclpy.context").Context()
         # Without rcl's own log: it would write files into ROS_HOME, which a service may not.
-        self.context.init(sys.argv, initialize_logging=False)
+        self.context.init(arguments, initialize_logging=False)
         parameter: Any = importlib.import_module("rclpy.parameter").Parameter
         self.node: Any = importlib.import_module("rclpy.node").Node(
             name,
             context=self.context,
+            namespace=namespace,
             enable_rosout=False,
             # Nobody would answer: only what is wanted is waited for.
             start_parameter_services=False,
             parameter_overrides=[parameter("start_type_description_service", value=False)],
         )
+        self.kinds: dict[str, list[Any]] = {}
+
+    def takes(self, topic: str, message_class: Any) -> bool:
+        """Whether the topic can have this type here."""
+        return all(one is message_class for one in self.kinds.get(topic, ()))
+
+    def close(self) -> None:
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+class RclpySession:
+    """The session of the agent's node, with further nodes for topics that have several types. Its attributes
+    are for the parts of this module."""
+
+    def __init__(self, name: str) -> None:
+        first = _Member(name, sys.argv)
+        self.context, self.node = first.context, first.node
+        self.members = [first]
         self.name = f"{self.node.get_namespace().rstrip('/')}/{self.node.get_name()}"
         self.sim_time = bool(self.node.get_parameter("use_sim_time").value)
         self._qos: Any = importlib.import_module("rclpy.qos")
@@ -82,14 +104,17 @@ class RclpySession:
     def subscribe(
         self, topic: str, message_class: Any, request: Request, take: Take, told: Told
     ) -> Subscription:
-        subscription = _Subscription(self, topic, (message_class, self._profile(request)), take, told)
+        member, profile = self._member(topic, message_class), self._profile(request)
+        subscription = _Subscription(self, member, topic, (message_class, profile), take=take, told=told)
         self.subscriptions.append(subscription)
         self.waiter.change()
         return subscription
 
     def advertise(self, topic: str, message_class: Any, depth: int) -> Publisher:
         profile = self._profile(Request(Offer(reliable=True, transient_local=False), depth))
-        return _Publisher(self.node.create_publisher(message_class, topic, profile))
+        member = self._member(topic, message_class)
+        member.kinds.setdefault(topic, []).append(message_class)
+        return _Publisher(member.node.create_publisher(message_class, topic, profile))
 
     def offer(self, service: str, trigger: Any, handler: OnTrigger) -> None:
         self.services.append(_Service(self, service, trigger, handler))
@@ -108,8 +133,17 @@ class RclpySession:
         self.waiter.close()
         for subscription in self.subscriptions[:]:
             subscription.close()
-        self.node.destroy_node()
-        self.context.try_shutdown()
+        for member in self.members:
+            member.close()
+
+    def _member(self, topic: str, message_class: Any) -> _Member:
+        for member in self.members:
+            if member.takes(topic, message_class):
+                return member
+        # Without the command line: its names are resolved already.
+        name = f"{self.node.get_name()}_{len(self.members)}"
+        self.members.append(_Member(name, [], self.node.get_namespace()))
+        return self.members[-1]
 
     def _profile(self, request: Request) -> Any:
         reliability, durability = self._qos.QoSReliabilityPolicy, self._qos.QoSDurabilityPolicy
@@ -136,16 +170,23 @@ class _Subscription:
     """The rclpy subscription of one type of a topic."""
 
     def __init__(
-        self, session: RclpySession, topic: str, kind: tuple[Any, Any], take: Take, told: Told
+        self,
+        session: RclpySession,
+        member: _Member,
+        topic: str,
+        kind: tuple[Any, Any],
+        *,
+        take: Take,
+        told: Told,
     ) -> None:
         self.take, (self.message_class, profile) = take, kind
-        self._session, self._node = session, session.node
+        self._session, self._member, self._topic = session, member, topic
         watched: dict[str, Callable[[Any], None]] = {
             event: _teller(told, reason) for event, reason in _WATCHED.items()
         }
         while True:
             try:
-                self.made: Any = self._node.create_subscription(
+                self.made: Any = member.node.create_subscription(
                     self.message_class,
                     topic,
                     self._receive,
@@ -160,6 +201,7 @@ class _Subscription:
                     raise
                 del watched["message_lost"]
         self.handle: Any = self.made.handle
+        member.kinds.setdefault(topic, []).append(self.message_class)
 
     def _receive(self, data: bytes, info: Mapping[str, Any]) -> None:
         """Called by the executor only."""
@@ -177,7 +219,7 @@ class _Subscription:
 
     def publishers(self) -> int:
         count = getattr(self.made, "get_publisher_count", None)
-        return int(count() if count is not None else self._node.count_publishers(self.made.topic_name))
+        return int(count() if count is not None else self._member.node.count_publishers(self._topic))
 
     def drain(self) -> None:
         while not self.take_some():
@@ -188,7 +230,8 @@ class _Subscription:
         if self in session.subscriptions:
             session.subscriptions.remove(self)
             session.waiter.change()
-            self._node.destroy_subscription(self.made)
+            self._member.kinds[self._topic].remove(self.message_class)
+            self._member.node.destroy_subscription(self.made)
 
 
 def _teller(told: Told, reason: str) -> Callable[[Any], None]:
@@ -331,18 +374,26 @@ class _Executor:
 
     def __init__(self, session: RclpySession) -> None:
         _log.warning("this rclpy has no wait sets: ROS messages take its executor, and more processor time")
-        executors: Any = importlib.import_module("rclpy.executors")
-        self.executor: Any = executors.SingleThreadedExecutor(context=session.context)
-        self.executor.add_node(session.node)
+        self._session = session
+        self._executors: list[Any] = []
+        self.change()
+        self.executor: Any = self._executors[0]
 
     def change(self) -> None:
-        """The executor looks by itself."""
+        """Each context has an executor of its own. It looks by itself."""
+        executors: Any = importlib.import_module("rclpy.executors")
+        for member in self._session.members[len(self._executors) :]:
+            self._executors.append(executors.SingleThreadedExecutor(context=member.context))
+            self._executors[-1].add_node(member.node)
 
     def wait(self, timeout_s: float) -> None:
-        self.executor.spin_once(timeout_sec=timeout_s)
+        several = len(self._executors) > 1
+        for executor in self._executors:
+            executor.spin_once(timeout_sec=min(timeout_s, _TURN_S) if several else timeout_s)
 
     def events(self) -> None:
         """They are handled in `wait`."""
 
     def close(self) -> None:
-        self.executor.shutdown()
+        for executor in self._executors:
+            executor.shutdown()

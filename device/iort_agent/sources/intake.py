@@ -36,6 +36,8 @@ _SILENT_S = 5.0
 _TOGETHER = 16
 # A message of this size costs so much that waiting for others saves nothing, and takes their memory.
 _LARGE_BYTES = 65_536
+# A message waits in the middleware while the agent is busy, but not longer.
+_WAITED_US = 10_000_000
 # A topic changes its definition when somebody rebuilds a package, not all the time.
 _MAX_KINDS = 32
 _MAX_PUBLISHERS = 32
@@ -109,12 +111,17 @@ class Intake:
         self._heard = clock.monotonic()
         self._silent = False
 
-    def receive(self, header: Mapping[str, str], data: bytes, source_ns: int = 0) -> None:
-        """Note a message that arrives now; ``source_ns`` is when the middleware says it was published. It is
-        taken with those before it, when the live lane wants one:
+    def receive(
+        self, header: Mapping[str, str], data: bytes, source_ns: int = 0, received_ns: int = 0
+    ) -> None:
+        """Note a message that arrives now, or that the middleware received at ``received_ns``; ``source_ns``
+        is when it was published. It is taken with those before it, when the live lane wants one:
         the first one after a pause costs as much as ten that follow it at once. Of a topic that falls silent,
         `look` takes them. Never raises."""
-        self._inbox.append((header, data, self._clock.now_us(), source_ns))
+        arrival_us, received_us = self._clock.now_us(), received_ns // 1000
+        if arrival_us - _WAITED_US < received_us < arrival_us:
+            arrival_us = received_us
+        self._inbox.append((header, data, arrival_us, source_ns))
         if len(self._inbox) >= _TOGETHER or self._clock.monotonic() >= self._due or len(data) > _LARGE_BYTES:
             self.take_received()
 

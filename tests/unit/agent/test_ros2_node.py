@@ -33,7 +33,7 @@ class Desk:
         self.topic.qos = qos or QosConfig()
         self.heard: list[tuple[Mapping[str, str], bytes, int]] = []
         self.every = 1
-        self.topic.takers = (lambda *message: self.heard.append(message),)
+        self.topic.takers = (lambda *message: self.heard.append(message[:3]),)
 
     def look(self, times: int = 1) -> None:
         for _ in range(times):
