@@ -82,14 +82,14 @@ def read() -> argparse.Namespace:
     options = parser.parse_args()
     if options.bag is not None and not options.bag.exists():
         parser.error(f"BAG must exist, got {options.bag}")
+    if options.bag is not None and (options.faults or options.ros2):
+        parser.error("FAULTS and ROS2 are of a simulated car: give no BAG")
     if options.bag is not None:
         try:
             with BagSource(BagConfig(path=options.bag), SystemClock()).open() as messages:
                 next(messages, None)
         except SourceError as error:
             parser.error(f"BAG={error}")
-        if options.faults or options.ros2:
-            parser.error("FAULTS and ROS2 are of a simulated car: give no BAG")
     if options.ros2:
         try:
             options.ros2 = ros2_car.find()

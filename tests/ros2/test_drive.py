@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from playwright.sync_api import Error
 
+from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_station import data
+from iort_station.operations import audit
 from iort_station.page import answers as control
 from iort_station.page import motion
 from iort_station.page.answers import actions, answers
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Page
 
+    from iort_station.cloud import Cloud
     from iort_station.fleet.robots import Bundle
     from local.cloud import EmbeddedCloud
     from tests.ros.process import Process
@@ -50,6 +54,14 @@ def twists(listener: Process) -> list[tuple[float, float]]:
         json.loads(line) for line in list(listener.lines) if line.startswith("[")
     ]
     return [(at, message["linear"]["x"]) for at, message in heard]
+
+
+def logged(cloud: Cloud, robot: str) -> str:
+    """The agent's log, as far as the cloud has it."""
+    if not list(audit.batches(cloud, robot, LOG_STREAM)):
+        return ""
+    lines = data.query(cloud, robot, LOG_STREAM, "-1h", "now").columns
+    return "\n".join(str(text) for column in lines.values() for text in column)
 
 
 def test_a_twist_from_the_page_reaches_a_foreign_node_and_ends_when_the_page_dies(
@@ -93,4 +105,5 @@ def test_a_twist_from_the_page_reaches_a_foreign_node_and_ends_when_the_page_die
     last = max(i for i, (_, speed) in enumerate(heard) if speed)
     assert len(heard) - last - 1 >= 5
     assert heard[last + 1][0] - heard[last][0] < LEASE_S + _SLOW_S
+    until(lambda: "nobody renews it, stopping" in logged(cloud, car.robot), "the agent's log in the cloud")
     assert agent.terminate() == 0, "\n".join(agent.errors)

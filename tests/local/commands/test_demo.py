@@ -141,6 +141,18 @@ def test_wrong_use_is_reported_at_once(refusal, arguments, said):
     assert said in refusal(*arguments)
 
 
+def test_without_ros2_the_demo_says_what_to_source(refusal, monkeypatch):
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    said = refusal("--ros2")
+    assert "ROS2=1 needs a ROS 2 of this Python" in said
+    assert "`source /opt/ros/" in said
+    assert "No module named 'rclpy'" in said
+
+
+def test_a_car_in_a_ros2_graph_plays_no_recording(refusal, tmp_path):
+    assert "ROS2 are of a simulated car: give no BAG" in refusal("--ros2", "--bag", tmp_path)
+
+
 def test_an_error_names_the_busy_port(refusal):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
