@@ -36,7 +36,7 @@ def test_the_car_is_recorded_and_driven_by_what_is_installed(
     source = load(Ros2Config, settings, PLACE)
     assert source.streams() == streams
     assert ros2.stream == streams[-1]
-    downlink = load(DownlinkConfig, ros2.downlink(60_000), PLACE)
+    downlink = load(DownlinkConfig, ros2.downlink(5_000), PLACE)
     downlink.check_topics()
     assert downlink.graph([source]).version == 2
     limits = downlink.drive_limits()
