@@ -118,7 +118,7 @@ def test_a_type_that_is_not_installed_is_named_with_what_to_do(packages: Path, k
 
 
 def test_a_definition_that_cannot_be_read_is_told(packages: Path, caplog: pytest.LogCaptureFixture) -> None:
-    message(packages, "a_msgs/A", "float64 x y\n")
+    message(packages, "a_msgs/A", "float64[99999999] x\n")
     types = Types()
     assert types.parsed("a_msgs/msg/A") is None
     assert "the definition of a_msgs/msg/A cannot be read" in caplog.text
