@@ -314,6 +314,7 @@ class _WaitSet:
     def change(self) -> None:
         """The session's subscriptions or services are others now."""
         self._set: Any = None
+        self._ready: frozenset[Any] = frozenset()
 
     def _fill(self) -> None:
         session = self._session
@@ -340,8 +341,12 @@ class _WaitSet:
         began = time.monotonic()
         wait_set.wait(int(timeout_s * 1e9))
         self._busy = time.monotonic() - began < _BUSY_S
-        for pointer in wait_set.get_ready_entities("subscription"):
-            self._subscriptions[pointer].take_some()
+        ready = wait_set.get_ready_entities("subscription")
+        for pointer in ready:
+            # To ask for a message that is not there takes as long as to take one: several are asked for only
+            # where there was one the last time, too.
+            self._subscriptions[pointer].take_some(_AT_ONCE if pointer in self._ready else 1)
+        self._ready = frozenset(ready)
         if self._services:
             for pointer in wait_set.get_ready_entities("service"):
                 self._services[pointer].serve()
