@@ -10,9 +10,11 @@ from tests.ros.test_downlink import (  # noqa: F401 - collected here, with the g
     TWIST,
     connected,
     drive,
+    drive_on,
     driven,
     has,
     heard,
+    start,
     test_a_command_is_not_kept_for_a_late_subscriber,
     test_a_command_is_published_and_its_lease_ends_in_stops,
     test_a_guard_that_dies_is_started_again_and_nothing_moves_meanwhile,
@@ -24,6 +26,19 @@ from tests.ros.test_downlink import (  # noqa: F401 - collected here, with the g
     test_another_robots_pose_appears_as_a_topic,
 )
 from tests.ros2.conftest import Graph
+
+
+def test_the_guard_takes_the_agents_namespace_and_remappings(graph: Graph) -> None:
+    rules = ["__ns:=/lab", "recorder:/cmd_vel:=/mux/cmd_vel", "__node:=recorder"]
+    downlink = start(graph, "--guard", "--ros-args", *(part for rule in rules for part in ("-r", rule)))
+    downlink.say("guard")
+    downlink.until(lambda: "guarded" in downlink.lines, "guard")
+    listener = graph.listener("driver", "/mux/cmd_vel", TWIST[2])
+    connected(downlink)
+    listener.until(lambda: "publishers 2" in listener.lines, "connection to agent and guard")
+    drive_on(downlink, listener, 1.5, 10_000)
+    downlink.signal(signal.SIGKILL)
+    listener.until(functools.partial(has, listener, 0), "the guard's stop")
 
 
 def test_a_frozen_subscriber_delays_no_command_and_no_stop(

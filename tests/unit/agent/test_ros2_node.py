@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -333,6 +334,25 @@ def test_an_advertised_topic_is_published(node: Node, graph: FakeGraph) -> None:
     assert (node.listeners("/cmd"), node.listeners("/other")) == (3, 0)
     with pytest.raises(SourceError, match=f"{LOST_TYPE} is not installed"):
         node.advertise("/cmd", LOST_TYPE)
+
+
+def test_a_stop_is_published_while_a_handler_holds_the_reading_thread(node: Node, graph: FakeGraph) -> None:
+    held, free = threading.Event(), threading.Event()
+
+    def take(_header: Mapping[str, str], _data: bytes) -> None:
+        held.set()
+        free.wait(5)
+
+    node.advertise("/cmd", IMU)
+    node.subscribe("/t", take)
+    publisher = graph.publisher("/t", IMU)
+    soon(lambda: node.connections("/t") == 1)
+    publisher.publish(CDR)
+    assert held.wait(5)
+    began = time.monotonic()
+    assert node.publish("/cmd", CDR)
+    assert time.monotonic() - began < 1
+    free.set()
 
 
 def test_other_nodes_are_known(node: Node, graph: FakeGraph) -> None:
