@@ -4,8 +4,8 @@ One thread owns the session, and with it every subscription and service. It look
 second while a wanted topic is missing, else once a second: rclpy tells of a new topic in no other way. The
 users of the node wait for none of this.
 
-Nobody tells which publisher a message is from, because rclpy leaves the GID of the publisher out. So all
-publishers of one type of a topic are one to the users of the node.
+Humble's and Jazzy's rclpy leave out which publisher a message is from, so all publishers of one type of a
+topic are one to the users of the node. Rolling's tells the publisher's GID.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ _log = logging.getLogger(__name__)
 _STEADY = 5
 # The next subscription has so many looks to connect.
 _CONNECT = 3
+_MAX_PUBLISHERS = 32
 _NOT_INSTALLED, _DIFFERS, _REFUSED = "type_not_installed", "definition_differs", "refused_by_middleware"
 
 # Takes a message: what a ROS 1 publisher's connection header has, its bytes, and the nanoseconds since the
@@ -44,6 +45,8 @@ class _Part:
         self.kind = kind
         self.asked = Request(Offer(reliable=False, transient_local=False), 0)
         self.header: Mapping[str, str] = {}
+        # The header of each publisher, where rclpy tells which one sent a message.
+        self.headers: dict[bytes, Mapping[str, str]] = {}
         self.now: Subscription | None = None
         self.before: Subscription | None = None
         # What came while there are two, and how many looks ago the second one began.
@@ -51,6 +54,15 @@ class _Part:
         self.looks = 0
         # At how many looks in a row more was offered than is requested.
         self.better = 0
+
+    def header_of(self, gid: bytes) -> Mapping[str, str]:
+        """The header of a publisher."""
+        header = self.headers.get(gid)
+        if header is None:
+            if len(self.headers) >= _MAX_PUBLISHERS:
+                self.headers.clear()
+            header = self.headers[gid] = {**self.header, "callerid": gid.hex()}
+        return header
 
     def settled(self) -> bool:
         """Whether nothing is about to change."""
@@ -148,6 +160,7 @@ class Topic:
         header = self._header(part, definition.text, definition.type_hash, endpoints)
         if header != part.header:
             part.header = header
+            part.headers.clear()
 
     def _adapt(self, part: _Part, asked: Request, publishers: int) -> None:
         """Request what is offered now."""
@@ -181,7 +194,9 @@ class Topic:
                 if key in both:
                     return
                 both.add(key)
-            header, received_ns = part.header, info.get("received_timestamp", 0)
+            gid, received_ns = info.get("publisher_gid"), info.get("received_timestamp", 0)
+            # Rolling tells it, Humble and Jazzy do not.
+            header = part.header if gid is None else part.header_of(bytes(gid["data"]))
             for taker in self.takers:
                 taker(header, data, source_ns, received_ns)
 

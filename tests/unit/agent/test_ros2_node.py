@@ -95,6 +95,19 @@ def test_a_topic_is_heard_once_somebody_publishes_it() -> None:
     assert desk.topic.report() == {"qos": "reliable, volatile"}
 
 
+def test_publishers_are_told_apart_where_rclpy_names_them() -> None:
+    desk = Desk()
+    desk.graph.publisher("/t", IMU)
+    desk.look()
+    (subscription,) = desk.graph.subscriptions
+    for gid in (b"\x01", b"\x02", b"\x01"):
+        subscription.take(CDR + gid, {"source_timestamp": 1, "publisher_gid": {"data": gid}})
+    first, second, third = [header for header, _, _ in desk.heard]
+    assert (first["callerid"], second["callerid"]) == ("01", "02")
+    assert first is third
+    assert {**first, "callerid": ""} == {**second, "callerid": ""}
+
+
 def test_a_restarted_publisher_needs_no_other_subscription_and_is_the_same_publisher() -> None:
     desk = Desk()
     for body in (b"1", b"2"):
