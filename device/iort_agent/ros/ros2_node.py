@@ -168,8 +168,11 @@ class Node:
         It keeps no message for subscribers that come later, because an old command must not run later.
         """
         self.definition(kind)
+        # Another robot's message may come when the node has left the graph.
+        if self._stop.is_set() or self.resolve(topic) in self._advertised:
+            return
         with self._lock:
-            self._advertised.setdefault(self.resolve(topic), kind)
+            self._advertised[self.resolve(topic)] = kind
         self._change()
 
     def offer(self, service: str, handler: OnTrigger) -> None:
@@ -184,8 +187,8 @@ class Node:
     def publish(self, topic: str, data: bytes) -> bool:
         """Publish a message's CDR bytes, with their encapsulation header, on an advertised topic; False if
         the node is not in the graph."""
-        publisher = self._publishers.get(self.resolve(topic))
-        if publisher is None or self._stop.is_set():
+        publisher = None if self._stop.is_set() else self._publishers.get(self.resolve(topic))
+        if publisher is None:
             return False
         try:
             publisher.publish(data)

@@ -349,6 +349,24 @@ def test_an_advertised_topic_is_published(node: Node, graph: FakeGraph) -> None:
         node.advertise("/cmd", LOST_TYPE)
 
 
+def test_a_node_that_has_left_the_graph_publishes_no_more() -> None:
+    graph = FakeGraph()
+    node = Node("iort_agent", graph.join, SystemClock(), FakeTypes(TEXTS))
+    node.users = 1
+    node.start()
+    node.advertise("/cmd", IMU)
+    soon(lambda: node.publish("/cmd", CDR))
+    node.close()
+
+    def gone(*_: object) -> Any:
+        raise RuntimeError("destroyed")
+
+    graph.wake = graph.resolve = gone  # type: ignore[method-assign]  # as rclpy's are then
+    node.advertise("/other", IMU)
+    assert not node.publish("/cmd", CDR)
+    assert not node.publish("/other", CDR)
+
+
 def test_a_stop_is_published_while_a_handler_holds_the_reading_thread(node: Node, graph: FakeGraph) -> None:
     held, free = threading.Event(), threading.Event()
 
