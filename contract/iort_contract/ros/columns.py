@@ -9,6 +9,7 @@ numbers do not become steps, the messages are stored unchanged.
 from __future__ import annotations
 
 import json
+import math
 import struct
 from contextlib import suppress
 from functools import lru_cache
@@ -102,7 +103,8 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
         return None
     decoder = decoder_of(messages.layout)
     # Most messages whose numbers are no steps show it at once.
-    numbers = _numbers(decoder, messages.raw) if _steps(decoder, messages.raw[-1]) else None
+    raws = messages.raw
+    numbers = _numbers(decoder, raws) if _steps(decoder, [raws[0], raws[len(raws) // 2], raws[-1]]) else None
     if numbers is None or max(map(len, numbers.names)) > MAX_FIELD_CHARACTERS:
         return None
     columns: dict[str, list[Value]] = {}
@@ -125,13 +127,18 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
     return None if heads is None else (written, COMPACT.encode([*about, *heads]))
 
 
-def _steps(decoder: Decoder, raw: bytes) -> bool:
-    """Whether each number of a message could be one of a column of steps."""
-    numbers = _numbers(decoder, [raw])
+def _steps(decoder: Decoder, raws: Sequence[bytes]) -> bool:
+    """Whether the numbers of some of the messages could be steps."""
+    numbers = _numbers(decoder, raws)
     if numbers is None:
         return False
-    values = set(numbers.readers[0].unpack_from(numbers.bodies[0]))
-    return all(packed([value])[0] is not None for value in values if type(value) is float and value == value)  # noqa: PLR0124 - no NaN
+    changing = [column for column in numbers.columns().values() if column.count(column[0]) < len(column)]
+    floats = [column for column in changing if all(map(_finite, column))]
+    return all(packed(column)[0] is not None for column in floats)
+
+
+def _finite(value: Value) -> bool:
+    return type(value) is float and math.isfinite(value)
 
 
 def _about_heads(
