@@ -144,13 +144,13 @@ def without_ros2(report: Any) -> bool:
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Say in the last lines what no package registry lets CI test."""
-    count = sum(map(without_ros2, terminalreporter.getreports("skipped")))
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Say in the last line what no package registry lets CI test."""
+    reporter = config.pluginmanager.getplugin("terminalreporter")
+    count = sum(map(without_ros2, reporter.getreports("skipped"))) if reporter else 0
     if count:
-        terminalreporter.write_line(
-            f"ROS 2: {count} {'test' if count == 1 else 'tests'} left out, since {ABSENT}"
-        )
+        tests = "1 test" if count == 1 else f"{count} tests"
+        reporter.write_line(f"ROS 2: {tests} left out, since {ABSENT}")
 
 
 @pytest.fixture(scope="session")
