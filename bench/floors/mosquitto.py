@@ -92,8 +92,11 @@ class Mosquitto:
         """A new certificate and its key, as files."""
         return self._authority.write(self._folder, name, HOST)
 
-    def car(self, topics: Mapping[str, Mapping[str, str]], source: str = "ros1") -> Path:
-        """Write and return the configuration of an agent that subscribes to these topics."""
+    def car(
+        self, topics: Mapping[str, Mapping[str, str]], source: str = "ros1", *, live: str = "always"
+    ) -> Path:
+        """Write and return the configuration of an agent that subscribes to these topics. ``live`` says when
+        it sends live messages: nobody holds a lease here."""
         certificate, key = self.identity(ROBOT)
         settings = {
             "robot": ROBOT,
@@ -104,8 +107,7 @@ class Mosquitto:
             "root_ca": str(self.ca),
             "sources": [{"type": source, "topics": {name: dict(one) for name, one in topics.items()}}],
             "queue": {"path": "spool.db"},
-            # Nobody holds a lease here.
-            "live": {"when": "always"},
+            "live": {"when": live},
         }
         config = self._folder / "car.yaml"
         config.write_text(yaml.safe_dump(settings))

@@ -7,6 +7,8 @@ SingleThreadedExecutor, and counts them.
 
 - the processor time a message, at 1000 Hz, at 50 topics of 20 Hz, which come together or evenly, and at
   30 Hz of 100 KB;
+- the same while somebody looks at each of the 50 topics; otherwise nobody does, and the live lane sends one
+  message of a topic in ten seconds;
 - the messages lost, by the publisher's own count;
 - the time from ROS publish to the broker over the live lane, beside the bare subscriber's arrival.
 
@@ -65,6 +67,8 @@ class Run:
 
     middleware: str
     load: str
+    # Whether somebody looks at every topic: ten live messages a second, as far as the limits allow.
+    live: bool
     messages: int
     cpu_us: dict[str, float]
     rss_mb: dict[str, float]
@@ -88,11 +92,11 @@ def run(_target: Target | None, say: Say, *, messages: int, duration: int) -> Se
         return section
     runs, live = list[Run](), dict[str, tuple[Spread, Spread, float]]()
     for middleware in [one for one in _MIDDLEWARES if one in ros2.middlewares()]:
-        for name in (FAST, MANY, SPREAD, BIG):
+        for name, looked_at in ((FAST, False), (MANY, False), (SPREAD, False), (BIG, False), (MANY, True)):
             load = LOADS[name]
             each = messages // len(load.topics) if name == FAST else load.rate_hz * duration
             say(f"{middleware}, {load.title}: {each * len(load.topics):,} messages")
-            runs.append(_measure(program, ros2, middleware, name, each))
+            runs.append(_measure(program, ros2, middleware, name, each, live=looked_at))
         say(f"{middleware}, {LOADS[LIVE].title}: the live lane for {duration} s")
         live[middleware] = _delays(program, ros2, middleware, duration)
     report(section, runs, live)
@@ -104,7 +108,7 @@ def _topics(load: Load) -> dict[str, dict[str, str]]:
     return {topic: {"stream": topic[1:].replace("/", "_"), "time": "header"} for topic in load.topics}
 
 
-def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int) -> Run:
+def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int, *, live: bool) -> Run:
     load, heard = LOADS[name], list[tuple[str, bytes]]()
     count, streams = each * len(load.topics), {one["stream"] for one in _topics(load).values()}
     with (
@@ -119,7 +123,8 @@ def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int) ->
         Ros2Graph(ros2, Path(path), middleware) as graph,
     ):
         folder = Path(path)
-        car, bag = broker.car(_topics(load), "ros2"), folder / "bag"
+        when = "always" if live else "watched"
+        car, bag = broker.car(_topics(load), "ros2", live=when), folder / "bag"
         written = folder / "report.json"
         processes = {
             AGENT: graph.start(
@@ -163,6 +168,7 @@ def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int) ->
     return Run(
         middleware,
         name,
+        live,
         count,
         {who: sum(us for us, _ in threads.values()) for who, threads in spent.items()},
         rss_mb,
@@ -293,16 +299,20 @@ def _watcher(broker: Mosquitto, folder: Path) -> Path:
     return folder
 
 
+def _title(one: Run) -> str:
+    return f"{LOADS[one.load].title}{', looked at' if one.live else ''}"
+
+
 def report(section: Section, runs: list[Run], live: dict[str, tuple[Spread, Spread, float]]) -> None:
     """Add the tables and the ratios."""
     order, rows = (AGENT, FLOOR, RECORDER), []
     for one in runs:
-        cells = [LOADS[one.load].title, one.middleware, f"{one.messages:,}"]
+        cells = [_title(one), one.middleware, f"{one.messages:,}"]
         for values, unit in ((one.cpu_us, " us"), (one.lost, ""), (one.rss_mb, " MB")):
             cells += [f"{values[who]:,.0f}{unit}" if who in values else NOT_MEASURED for who in order]
         rows.append(cells)
-        title = f"{LOADS[one.load].title}, {one.middleware}"
-        for who, most in ((FLOOR, None if one.load == BIG else CPU_TIMES), (RECORDER, None)):
+        title = f"{_title(one)}, {one.middleware}"
+        for who, most in ((FLOOR, None if one.load == BIG or one.live else CPU_TIMES), (RECORDER, None)):
             if who in one.cpu_us:
                 name = f"{title}: the agent's processor / {who}'s"
                 section.ratio(name, one.cpu_us[AGENT] / one.cpu_us[who], most)
@@ -329,7 +339,7 @@ def report(section: Section, runs: list[Run], live: dict[str, tuple[Spread, Spre
     names = {name: None for one in runs for name in one.threads}
     section.table(
         "The agent's threads: us a message, wake-ups a second",
-        ["thread", *(f"{LOADS[one.load].title}, {one.middleware}" for one in runs)],
+        ["thread", *(f"{_title(one)}, {one.middleware}" for one in runs)],
         [
             [name, *("{:.1f}, {:.0f}".format(*one.threads.get(name, (0, 0))) for one in runs)]
             for name in names
