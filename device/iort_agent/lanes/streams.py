@@ -75,6 +75,8 @@ class BatchEncoder:
         self._lock = threading.Lock()
         # By the part of time that they hold, oldest first.
         self._open: dict[tuple[int, int], _Open] = {}
+        # No batch is to be closed before: of fifty topics, few have one at a tick.
+        self.due = math.inf
 
     def add(self, t_us: int, values: Mapping[str, Value]) -> None:
         """Take a sample; the mapping must not change afterwards."""
@@ -89,6 +91,7 @@ class BatchEncoder:
                 while len(self._open) >= _MOST_OPEN:
                     self._close(next(iter(self._open)))
                 batch = self._open[slot] = _Open(now)
+                self.due = min(self.due, now + self._batch_s + _GRACE_S)
             batch.samples.append((t_us, values))
             # Only to know when to close: looking into each message would cost more than keeping it.
             if isinstance(values, RosMessage):
@@ -107,10 +110,10 @@ class BatchEncoder:
         """Close the batches of a topic that has fallen silent; when the next one is due."""
         age_s = self._batch_s + _GRACE_S
         with self._lock:
-            if not self._open:
-                return math.inf
-            self._close_older(self._clock.monotonic(), age_s)
-            return min((batch.opened for batch in self._open.values()), default=math.inf) + age_s
+            if self._open:
+                self._close_older(self._clock.monotonic(), age_s)
+            self.due = min((batch.opened for batch in self._open.values()), default=math.inf) + age_s
+            return self.due
 
     def flush(self) -> None:
         """Close every batch, whatever it holds."""
@@ -263,7 +266,8 @@ class Streams:
 
     def tick(self) -> float:
         """Close the batches of silent streams; when the next one is due."""
-        return min([encoder.tick() for encoder in list(self._encoders.values())], default=math.inf)
+        now, encoders = self._clock.monotonic(), list(self._encoders.values())
+        return min([one.tick() if now >= one.due else one.due for one in encoders], default=math.inf)
 
     def flush(self) -> None:
         """Close every batch."""
