@@ -189,7 +189,7 @@ class _Subscription:
                 self.made: Any = member.node.create_subscription(
                     self.message_class,
                     topic,
-                    self._receive,
+                    take,
                     profile,
                     raw=True,
                     event_callbacks=_events(watched),
@@ -202,10 +202,6 @@ class _Subscription:
                 del watched["message_lost"]
         self.handle: Any = self.made.handle
         member.kinds.setdefault(topic, []).append(self.message_class)
-
-    def _receive(self, data: bytes, info: Mapping[str, Any]) -> None:
-        """Called by the executor only."""
-        self.take(data, info)
 
     def take_some(self, most: int = _AT_ONCE) -> bool:
         """Deliver what waits; whether that was less than ``most`` messages."""
