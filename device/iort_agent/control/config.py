@@ -104,8 +104,9 @@ class MotionConfig:
 
 @dataclass(frozen=True)
 class CommandConfig:
-    """A command's ROS topic. With ``partial``, missing fields are zero; otherwise such a command is rejected.
-    A command older than ``max_age_s`` is rejected, even if it allows a longer time."""
+    """A command's ROS topic; ``type`` is package/Type, and package/msg/Type in ROS 2. With ``partial``,
+    missing fields are zero; otherwise such a command is rejected. A command older than ``max_age_s`` is
+    rejected, even if it allows a longer time."""
 
     topic: str = setting(text(ros_name))
     type: str = setting(text(_ros_type))
