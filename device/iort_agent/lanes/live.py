@@ -44,6 +44,7 @@ from iort_contract.limits import (
     Value,
 )
 from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.ros.message import RosMessage
 from iort_contract.topics import live_topic
 
 _log = logging.getLogger(__name__)
@@ -168,6 +169,8 @@ class TempoMeter:
 
 
 _FASTEST_S = 1 / LIVE_MAX_RATE_HZ
+# While nobody looks, so many seconds of messages are taken together: a batch closes after one.
+_TOGETHER_S = 0.3
 _PRESENT_S = LIVE_MAX_AGE_MS / 1000
 
 
@@ -253,7 +256,8 @@ class LiveLane:
                 self._take_turn(slot, now)
             self._serve(now)
             # Another fault code may come at any time, and does not wait for a slow rate.
-            return min(slot.due, now + _FASTEST_S)
+            faulty = not isinstance(values, RosMessage) or values.kind.has(FAULT_FIELD)
+            return min(slot.due, now + (_FASTEST_S if faulty else _TOGETHER_S))
 
     def tick(self) -> None:
         """Send what waits since a stream fell silent or the connection was lost."""
