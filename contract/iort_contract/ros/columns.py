@@ -31,7 +31,8 @@ from iort_contract.ros.message import MAX_LAYOUT, Messages
 from iort_contract.ros.plan import CDR_LITTLE, CDR_START, Run, fits
 
 _NS = 1_000_000_000
-# The limit for all frame_ids of a batch; messages with longer ones are stored unchanged.
+# The limit for all frame_ids of a batch, and for what is beside its numbers; messages with more are stored
+# unchanged.
 _MAX_FRAMES = 256 * 1024
 # Our batches hold at most this many values; in a batch of other software, the rest is not decoded.
 _MAX_VIEWED = 2 * MAX_BATCH_VALUES
@@ -119,6 +120,8 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
     about: list[Any] = [messages.type_id]
     if decoder.ros2:
         rests = _rests(decoder, numbers, messages.raw)
+        if 2 * sum(map(len, rests)) > _MAX_FRAMES and len(set(rests)) > 1:
+            return None
         rows = _completed(decoder, numbers.starts, rows, rests)
         about.append(_once([rest.hex() for rest in rests]))
     if rows != numbers.bodies:
@@ -281,7 +284,7 @@ def _numbers(decoder: Decoder, raws: Sequence[bytes]) -> _Numbers | None:
         first = CDR_HEADER.size
         fit = all(
             raw[:2] == CDR_LITTLE
-            and (not decoder.stamped or raw[start - 1 : start] == b"\0" < raw[first - 4 : first])
+            and (not decoder.stamped or (start > first and raw[start - 1 : start] == b"\0"))
             and fits(start + reader.size, len(raw), ros2=True)
             for raw, start, reader in zip(raws, starts, readers)
         )

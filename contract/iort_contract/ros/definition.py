@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from typing import Iterator, NamedTuple, Tuple
+from typing import Container, Iterator, NamedTuple, Tuple
 
 from iort_contract.limits import MessageError
 
@@ -115,9 +115,11 @@ class Definition(NamedTuple):
 def parse(kind: str, text: str) -> Definition:
     """Parse a definition; raises `MessageError` if it is invalid."""
     definition = Definition(kind, {TIME: _ROS2_TIME, DURATION: _ROS2_TIME} if is_ros2(kind) else {**TIMES})
-    fields = _ros2_fields if definition.ros2 else _fields
-    for name, body in _sections(kind, text):
-        definition.types[name] = tuple(fields(name, body))
+    sections = dict(_sections(kind, text))
+    for name, body in sections.items():
+        definition.types[name] = tuple(
+            _ros2_fields(name, body, sections) if definition.ros2 else _fields(name, body)
+        )
     _check(definition, short_kind(kind), (), set())
     return definition
 
@@ -202,7 +204,7 @@ def _fields(kind: str, text: str) -> Iterator[Field]:
         yield Field(name, base, None if length is None else int(length or VARIABLE))
 
 
-def _ros2_fields(kind: str, text: str) -> Iterator[Field]:
+def _ros2_fields(kind: str, text: str, known: Container[str]) -> Iterator[Field]:
     package = kind.partition("/")[0]
     for line in text.splitlines():
         stripped = line.split("#", 1)[0].strip()
@@ -221,7 +223,8 @@ def _ros2_fields(kind: str, text: str) -> Iterator[Field]:
         base = short_kind(base)
         if base == "byte":
             base = "char"
-        elif base == "Header":
+        # Written for ROS 1, unless the package has a type of this name.
+        elif base == "Header" and f"{package}/Header" not in known:
             base = HEADER_TYPE
         elif "/" not in base and base not in LETTERS and base not in (*TEXTS, TIME, DURATION):
             base = f"{package}/{base}"

@@ -166,13 +166,32 @@ def test_any_valid_header_is_restored(raws: list[bytes]) -> None:
         stamped(1).replace(b"base_link", b"base\xfflink"),
         stamped(1).replace(b"link\0", b"link!"),
         stamped(1)[:12] + bytes(4) + stamped(1)[16:20],
+        Cdr().put("i", 1_700_000_000).put("I", 1_000_250, 0).put("d", 0.25).put("B", 1).data,
         stamped(1)[:14],
         stamped(1)[:12] + b"\xff\xff\xff\xff" + stamped(1)[16:],
     ],
-    ids=["nanoseconds", "no Unicode", "no NUL", "no text", "cut", "a long frame_id"],
+    ids=[
+        "nanoseconds",
+        "no Unicode",
+        "no NUL",
+        "no text",
+        "an empty text without its NUL",
+        "cut",
+        "a long frame_id",
+    ],
 )
 def test_an_invalid_header_is_restored(odd: bytes) -> None:
     assert again(STAMPED, [stamped(0), odd, stamped(2)]) == ROS2_CODEC
+
+
+def test_gaps_of_more_bytes_than_a_reader_takes_are_kept_as_bytes() -> None:
+    kind = RosType("/gaps", "a_msgs/msg/G", HASH, "".join(f"bool b{i}\nfloat64 x{i}\n" for i in range(30)))
+    raws = [
+        b"\0\1\0\0" + b"".join(b"\1" + bytes([i % 7] * 7) + struct.pack("<d", i / 4) for _ in range(30))
+        for i in range(800)
+    ]
+    assert again(kind, raws, {kind.id: kind.layout}) == ROS2_CODEC
+    assert again(kind, raws[::7], {kind.id: kind.layout}) == CODEC
 
 
 def test_columns_are_smaller_than_the_messages_bytes() -> None:

@@ -119,6 +119,13 @@ def test_a_definition_is_parsed_with_its_bounds_under_short_names() -> None:
     ]
 
 
+def test_a_header_without_its_package_is_of_the_same_package_if_that_has_one() -> None:
+    own = parse("a_msgs/msg/A", f"Header h\n{LINE}MSG: a_msgs/Header\nuint8 x\n")
+    assert own.fields()[0].kind == "a_msgs/Header"
+    assert Decoder(own).decode(b"\0\1\0\0\7") == {"h.x": 7}
+    assert parse("a_msgs/msg/A", f"Header header{HEADER}").stamped()
+
+
 def test_times_may_be_defined_in_the_text_or_not() -> None:
     times = f"{LINE}MSG: builtin_interfaces/msg/Time\nint32 sec\nuint32 nanosec\n"
     for own in ("", times):
