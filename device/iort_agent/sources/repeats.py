@@ -11,7 +11,7 @@ import hashlib
 import json
 import logging
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, Mapping
 
 from iort_agent.common.private_files import open_below, write_below
 from iort_agent.common.threads import Clock
@@ -53,8 +53,8 @@ class Repeats:
         self._clock = clock
         self._topics: dict[str, Latched] = {}
         self._kept = self._read()
-        # Since when a change waits to be written.
-        self._since: float | None = None
+        # What is to be written, and since when it settles.
+        self._settling: tuple[float, dict[str, dict[str, str]]] | None = None
 
     def of(self, stream: str, topic: str) -> Latched:
         """The memory of a topic."""
@@ -65,23 +65,32 @@ class Repeats:
 
     def tick(self) -> None:
         """Write what has changed, once it has settled; called several times a second."""
-        changed = any(topic.changed for topic in self._topics.values())
-        if not changed:
-            return
         now = self._clock.monotonic()
-        self._since = self._since if self._since is not None else now
-        if now - self._since >= _SETTLED_S:
-            self.write()
+        if self._settling is None:
+            if self._changed():
+                self._settling = now, self._all()
+        elif now - self._settling[0] >= _SETTLED_S:
+            # Without what has changed since: its messages may be in memory only.
+            self._save(self._settling[1])
+            self._settling = None
 
     def write(self) -> None:
         """Write all, as at the end of a run."""
-        if self._file is None or not any(topic.changed for topic in self._topics.values()):
-            return
-        self._since = None
+        if self._settling is not None or self._changed():
+            self._settling = None
+            self._save(self._all())
+
+    def _changed(self) -> bool:
+        return self._file is not None and any(topic.changed for topic in self._topics.values())
+
+    def _all(self) -> dict[str, dict[str, str]]:
         for topic in self._topics.values():
             topic.changed = False
         # Those of topics that this run has not seen yet stay.
-        kept = {**self._kept, **{name: dict(topic.digests) for name, topic in self._topics.items()}}
+        return {**self._kept, **{name: dict(topic.digests) for name, topic in self._topics.items()}}
+
+    def _save(self, kept: Mapping[str, Mapping[str, str]]) -> None:
+        assert self._file is not None
         try:
             write_below(self._file.parent, PurePath(self._file.name), json.dumps(kept).encode())
         except OSError as error:

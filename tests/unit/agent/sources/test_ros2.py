@@ -347,6 +347,24 @@ def test_the_memory_is_written_once_its_messages_are_in_the_queue(tmp_path: Path
     assert not again.of("other", "/t").came_before("1", b"one")
 
 
+def test_a_message_that_comes_while_another_settles_waits_for_its_own_time(tmp_path: Path) -> None:
+    clock, queue = ManualClock(), tmp_path / "queue.db"
+    repeats = Repeats(queue, clock)
+    repeats.of("s", "/t").came_before("1", b"one")
+    repeats.tick()
+    clock.advance(2.0)
+    repeats.of("s", "/t").came_before("2", b"two")
+    repeats.tick()
+    # After a crash now, the second message must be stored again.
+    crashed = Repeats(queue, clock).of("s", "/t")
+    assert crashed.came_before("1", b"one")
+    assert not crashed.came_before("2", b"two")
+    repeats.tick()
+    clock.advance(2.0)
+    repeats.tick()
+    assert Repeats(queue, clock).of("s", "/t").came_before("2", b"two")
+
+
 def test_the_memory_is_bounded_and_keeps_topics_that_this_run_has_not_seen(tmp_path: Path) -> None:
     queue = tmp_path / "queue.db"
     first = Repeats(queue, ManualClock())
