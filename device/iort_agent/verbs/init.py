@@ -71,7 +71,9 @@ class Line(NamedTuple):
         """As car.yaml has them."""
         time = HEADER if self.topic.stamped else ARRIVAL
         large = f", large: {UPLOAD}" if self.large else ""
-        return f"{{stream: {self.stream}, time: {time}{large}}}"
+        # YAML reads on and null otherwise.
+        stream = self.stream if yaml.safe_load(self.stream) == self.stream else f'"{self.stream}"'
+        return f"{{stream: {stream}, time: {time}{large}}}"
 
     def comes(self) -> str:
         """How often it comes, and how large."""

@@ -121,6 +121,16 @@ def topics(file: Path) -> dict[str, Any]:
     return found
 
 
+def test_names_that_yaml_reads_otherwise_are_streams_too(tmp_path: Path) -> None:
+    names = ["on", "no", "null", "true", "e5", "y"]
+    clock = ManualClock()
+    publishers = {f"/{name}": ("a/Drive", "float64 x", bytes(8)) for name in names}
+    written = Robot(tmp_path, FakeNode(clock, publishers), clock=clock).init()
+    assert {name: topic["stream"] for name, topic in topics(written).items()} == {
+        f"/{name}": name for name in names
+    }
+
+
 def test_what_is_small_is_recorded_and_what_is_not_says_why(
     robot: Robot, capsys: pytest.CaptureFixture[str]
 ) -> None:
