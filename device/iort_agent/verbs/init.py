@@ -191,13 +191,15 @@ def beside(file: Path, section: str, version: int) -> str:
     rest = _SOURCES.sub("", text)
     if version:
         rest = _TYPE.sub(r"\1/msg/\3" if version == 2 else r"\1/\3", rest)
+    whole = f"{rest.strip()}\n\n{section}"
     try:
-        good = {*(yaml.safe_load(rest) or ())} == {*before} - {"sources"}
+        kept = {*before} - {"sources"}
+        good = {*(yaml.safe_load(rest) or ())} == kept and {*yaml.safe_load(whole)} >= kept
     except yaml.YAMLError:
         good = False
     if not good:
         raise ConfigError(f"{file}: cannot be rewritten; put this into it by hand:\n{section}")
-    return f"{rest.strip()}\n\n{section}"
+    return whole
 
 
 class Seams(NamedTuple):

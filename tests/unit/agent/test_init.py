@@ -193,7 +193,7 @@ def test_a_file_without_sources_or_with_others_gets_new_ones(robot: Robot, befor
     }
 
 
-@pytest.mark.parametrize("before", ["sources: [\n]\n", "- a\n", "'sources': []\n"])
+@pytest.mark.parametrize("before", ["sources: [\n]\n", "- a\n", "'sources': []\n", "robot: a\n...\n"])
 def test_a_file_that_cannot_be_rewritten_is_told_what_to_paste(robot: Robot, before: str) -> None:
     robot.out.write_text(before)
     with pytest.raises(ConfigError, match=r"must be a mapping|put this into it by hand:\n(.|\n)*/odom: "):
