@@ -116,10 +116,14 @@ class Node:
         return next((topic.why for topic in [*self._wanted.values()] if topic.why is not None), None)
 
     def resolve(self, topic: str) -> str:
-        """The topic's name in the graph, as the command line may remap it."""
+        """The topic's name in the graph, as the command line may remap it. Raises `SourceError` for a name
+        that ROS 2 does not allow."""
         # A report comes after the node has left the graph, and can ask nobody any more.
         if topic not in self._names:
-            self._names[topic] = self._session.resolve(topic)
+            try:
+                self._names[topic] = self._session.resolve(topic)
+            except Exception as error:
+                raise SourceError(f"{topic} is no name of a topic in ROS 2: {error}") from error
         return self._names[topic]
 
     def subscribe(self, topic: str, handler: OnBytes) -> None:
@@ -266,5 +270,5 @@ class Node:
     def _serve(self, name: str, handler: OnTrigger) -> None:
         try:
             self._session.offer(name, service_class(_TRIGGER), handler)
-        except SourceError as error:
+        except Exception as error:  # noqa: BLE001 - rclpy's own, as for its name; all else must go on
             _log.error("the service %s is not offered: %s", name, error)

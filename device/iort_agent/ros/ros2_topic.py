@@ -198,7 +198,10 @@ class Topic:
             # Rolling tells it, Humble and Jazzy do not.
             header = part.header if gid is None else part.header_of(bytes(gid["data"]))
             for taker in self.takers:
-                taker(header, data, source_ns, received_ns)
+                try:
+                    taker(header, data, source_ns, received_ns)
+                except Exception:  # noqa: BLE001, PERF203 - a taker's error costs this message, not the node
+                    _log.exception("topic %s: a message could not be taken", self.name)
 
         def told(reason: str, many: int) -> None:
             if reason == INCOMPATIBLE:

@@ -29,6 +29,7 @@ _log = logging.getLogger(__name__)
 _LOOK_S = 0.3
 _TOPIC = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
 _PATTERN = re.compile(r"/[\w/]*\*[\w/*]*", re.ASCII)
+_DIGIT_FIRST = re.compile(r"/\d", re.ASCII)
 _NODE = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _MAX_STREAM = 64
 _MAX_TOPICS = 1000
@@ -48,8 +49,11 @@ def node_name(value: str) -> str:
     return value
 
 
-def _name_or_pattern(value: str) -> str:
-    return value if _PATTERN.fullmatch(value) else ros_name(value)
+def ros2_name(value: str) -> str:
+    """As `ros_name`, of a topic of ROS 2."""
+    if _DIGIT_FIRST.search(ros_name(value)):
+        raise ContractError(f"ROS 2 topic must have no part that begins with a digit, got {value!r}")
+    return value
 
 
 @dataclass(frozen=True)
@@ -62,13 +66,17 @@ class TopicConfig(intake.TopicConfig):
     large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
 
 
-def topics_rule(kind: type[TopicConfig]) -> Callable[[Any, Place], Any]:
-    """The rule for a mapping of topics to their settings, of which each gets its stream."""
+def topics_rule(
+    kind: type[TopicConfig], named: Callable[[str], str] = ros_name
+) -> Callable[[Any, Place], Any]:
+    """The rule for a mapping of topics to their settings, of which each gets its stream. ``named`` checks the
+    names that are no patterns."""
     mapping = pairs(section(kind), what="a mapping of ROS topic to its stream and time")
 
     def rule(value: Any, where: Place) -> Any:
         for name in value if isinstance(value, dict) else ():
-            text(_name_or_pattern)(name, where)
+            if not (isinstance(name, str) and _PATTERN.fullmatch(name)):
+                text(named)(name, where)
         return tuple(
             (name, replace(topic, stream=topic.stream or ("" if "*" in name else stream_of(name))))
             for name, topic in mapping(value, where)

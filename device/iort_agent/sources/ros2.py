@@ -20,7 +20,7 @@ from iort_agent.ros.ros2_node import DEFAULT_NODE, shared
 from iort_agent.ros.ros2_types import rclpy
 from iort_agent.sources import FAIL, OK, WARN, Finding, ros
 from iort_agent.sources.intake import ARRIVAL, HEADER, SOURCE, Intake
-from iort_agent.sources.ros import RosConfig, RosSource, node_name, topics_rule
+from iort_agent.sources.ros import RosConfig, RosSource, node_name, ros2_name, topics_rule
 
 # What chooses the part of the network in which robots find each other: until Humble, and since Iron.
 # With any of these, Fast DDS need not share memory.
@@ -49,7 +49,7 @@ class Ros2Config(RosConfig):
 
     ros = 2
 
-    topics: tuple[tuple[str, TopicConfig], ...] = setting(topics_rule(TopicConfig))
+    topics: tuple[tuple[str, TopicConfig], ...] = setting(topics_rule(TopicConfig, ros2_name))
     node: str = setting(text(node_name), DEFAULT_NODE)
 
     def describe(self) -> str:

@@ -90,6 +90,7 @@ class FakeGraph:
         self.services: dict[str, OnTrigger] = {}
         self.others: list[str] = []
         self.remapped: dict[str, str] = {}
+        self.forbidden: set[str] = set()
         self.refused: Callable[[str], bool] = lambda _topic: False
         self.fails: BaseException | None = None
         self.closed = False
@@ -112,6 +113,8 @@ class FakeGraph:
     # The session.
 
     def resolve(self, topic: str) -> str:
+        if topic in self.forbidden:
+            raise RuntimeError("failed to resolve name")
         return self.remapped.get(topic, topic)
 
     def topics(self) -> dict[str, list[str]]:
@@ -148,6 +151,8 @@ class FakeGraph:
         return FakeOwn(self, topic)
 
     def offer(self, service: str, _trigger: Any, handler: OnTrigger) -> None:
+        if service in self.forbidden:
+            raise RuntimeError("invalid service name")
         self.services[service] = handler
 
     def wait(self, timeout_s: float) -> None:

@@ -331,6 +331,35 @@ def test_a_handler_hears_a_topic_that_appears_later(node: Node, graph: FakeGraph
     assert node.topics == ("/t",)
 
 
+def test_a_handler_that_fails_costs_neither_the_node_nor_other_handlers(
+    node: Node, graph: FakeGraph, caplog: pytest.LogCaptureFixture
+) -> None:
+    heard: list[bytes] = []
+
+    def fail(_header: Mapping[str, str], _data: bytes) -> None:
+        raise ValueError("no room")
+
+    node.subscribe("/t", fail)
+    node.subscribe("/t", lambda _header, data: heard.append(data))
+    publisher = graph.publisher("/t", IMU)
+    soon(lambda: node.connections("/t") == 1)
+    for i in range(2):
+        publisher.publish(CDR + bytes([i]))
+    soon(lambda: len(heard) == 2)
+    assert node.failed is None
+    assert "topic /t: a message could not be taken" in caplog.text
+
+
+def test_a_name_that_ros_does_not_allow_is_named(node: Node, graph: FakeGraph) -> None:
+    graph.forbidden = {"/a/1b"}
+    with pytest.raises(SourceError, match="/a/1b is no name of a topic in ROS 2"):
+        node.subscribe("/a/1b", lambda *_: None)
+    node.offer("/a/1b", lambda: (True, ""))
+    node.subscribe("/t", lambda *_: None)
+    graph.publisher("/t", IMU)
+    soon(lambda: node.connections("/t") == 1)
+
+
 def test_names_are_remapped(node: Node, graph: FakeGraph) -> None:
     graph.remapped["/t"] = "/car1/t"
     graph.publisher("/car1/t", IMU)

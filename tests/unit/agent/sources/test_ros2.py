@@ -251,6 +251,7 @@ def test_quality_of_service_may_be_set() -> None:
     [
         ("topics: {t: {time: header}}", "ROS topic must be a full name such as /sensors/core, got 't'"),
         ("topics: {'a/*': {time: header}}", "must be a full name"),
+        ("topics: {/motor/1/x: {time: header}}", "must have no part that begins with a digit"),
         ("topics: {/t: {stream: s}}", "time: required"),
         ("topics: {/t: {time: never}}", "one of header, arrival, source"),
         ("topics: {/t: {time: header, qos: {depth: 0}}}", "depth: must be a whole number from 1"),
