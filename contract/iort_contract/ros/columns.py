@@ -120,7 +120,7 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
     about: list[Any] = [messages.type_id]
     if decoder.ros2:
         rests = _rests(decoder, numbers, messages.raw)
-        if 2 * sum(map(len, rests)) > _MAX_FRAMES and len(set(rests)) > 1:
+        if 2 * sum(map(len, rests)) > _MAX_FRAMES:
             return None
         rows = _completed(decoder, numbers.starts, rows, rests)
         about.append(_once([rest.hex() for rest in rests]))

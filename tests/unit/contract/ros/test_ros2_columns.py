@@ -184,10 +184,12 @@ def test_an_invalid_header_is_restored(odd: bytes) -> None:
     assert again(STAMPED, [stamped(0), odd, stamped(2)]) == ROS2_CODEC
 
 
-def test_gaps_of_more_bytes_than_a_reader_takes_are_kept_as_bytes() -> None:
+@pytest.mark.parametrize("different", [1, 7])
+def test_gaps_of_more_bytes_than_a_reader_takes_are_kept_as_bytes(different: int) -> None:
     kind = RosType("/gaps", "a_msgs/msg/G", HASH, "".join(f"bool b{i}\nfloat64 x{i}\n" for i in range(30)))
     raws = [
-        b"\0\1\0\0" + b"".join(b"\1" + bytes([i % 7] * 7) + struct.pack("<d", i / 4) for _ in range(30))
+        b"\0\1\0\0"
+        + b"".join(b"\1" + bytes([i % different] * 7) + struct.pack("<d", i / 4) for _ in range(30))
         for i in range(800)
     ]
     assert again(kind, raws, {kind.id: kind.layout}) == ROS2_CODEC
