@@ -234,7 +234,8 @@ class Topic:
             "md5sum": type_hash,
             **fitting,
             "callerid": endpoints[0].node if len(endpoints) == 1 else "",
-            "latching": "1" if part.asked.offer.transient_local else "0",
+            # Also where it is not requested yet: what comes now may come again once it is.
+            "latching": "1" if any(one.offer.transient_local for one in endpoints) else "0",
         }
 
     def _leave_out(self, reason: str, why: str) -> None:

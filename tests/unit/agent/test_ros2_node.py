@@ -16,6 +16,7 @@ from iort_agent.ros.qos import DEPTH, DEPTH_OF_LARGE, Offer, QosConfig, fits, re
 from iort_agent.ros.ros2_node import Node
 from iort_agent.ros.ros2_session import LOST
 from iort_agent.ros.ros2_topic import Topic
+from iort_agent.sources.intake import Intake, TopicConfig
 from testkit.agent import ManualClock
 from testkit.waiting import until
 from tests.unit.agent.ros2_graph import BEST_EFFORT, LATCHED, RELIABLE, FakeGraph, FakeTypes
@@ -173,6 +174,28 @@ def test_more_is_requested_once_it_was_offered_for_a_while() -> None:
     desk.look(3)
     assert desk.requests() == ["reliable, volatile"]
     assert desk.topic.report() == {"qos": "reliable, volatile"}
+
+
+def test_a_latched_message_that_comes_again_with_another_request_is_known() -> None:
+    desk, samples = Desk(), []
+
+    def emit(stream: str, *_sample: Any, **_more: Any) -> float:
+        samples.append(stream)
+        return 0.0
+
+    intake = Intake("/t", TopicConfig("arrival", "t"), emit=emit, clock=desk.clock)
+    desk.topic.takers = (*desk.topic.takers, intake.receive)
+    plain = desk.graph.publisher("/t", IMU)
+    desk.graph.publisher("/t", IMU, LATCHED).publish(CDR + bytes(12), 77)
+    latched = desk.graph.publishers_[1]
+    desk.look()
+    latched.publish(CDR + bytes(12), 78)
+    desk.look()
+    plain.end()
+    desk.look(9)
+    assert desk.requests() == ["reliable, transient_local"]
+    assert [source_ns for _, _, source_ns in desk.heard] == [78, 78]
+    assert samples.count("t") == 1
 
 
 def test_what_the_settings_demand_and_a_publisher_does_not_offer_is_counted(
