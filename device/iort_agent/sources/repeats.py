@@ -2,7 +2,8 @@
 run of the agent, and are not stored twice.
 
 The memory is a small file beside the queue. It is written only when the messages are in the queue: after a
-crash a message is rather stored twice than lost.
+crash a message is rather stored twice than lost. After the computer was started again, the same map of the
+same publisher is another drive's: only the times at which messages of ROS 2 were published are remembered.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ _log = logging.getLogger(__name__)
 _MAX_MESSAGES, _MAX_BYTES = 256, 4_000_000
 # An open batch gets into the queue within a second.
 _SETTLED_S = 2.0
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+# The boot's name in the file; those of topics have a space.
+_BOOT = "boot"
 
 
 class Latched:
@@ -48,10 +52,11 @@ class Repeats:
     """The memory of a source: of each stream and topic. ``queue`` is the queue's file; without it, the memory
     ends with the process."""
 
-    def __init__(self, queue: Path | None, clock: Clock) -> None:
+    def __init__(self, queue: Path | None, clock: Clock, boot: Path = _BOOT_ID) -> None:
         self._file = queue.with_name(f"{queue.name}.latched") if queue is not None else None
         self._clock = clock
         self._topics: dict[str, Latched] = {}
+        self._boot = boot.read_text(encoding="ascii").strip() if boot.exists() else ""
         self._kept = self._read()
         # What is to be written, and since when it settles.
         self._settling: tuple[float, dict[str, dict[str, str]]] | None = None
@@ -87,7 +92,8 @@ class Repeats:
         for topic in self._topics.values():
             topic.changed = False
         # Those of topics that this run has not seen yet stay.
-        return {**self._kept, **{name: dict(topic.digests) for name, topic in self._topics.items()}}
+        topics = {name: dict(topic.digests) for name, topic in self._topics.items()}
+        return {_BOOT: {_BOOT: self._boot}, **self._kept, **topics}
 
     def _save(self, kept: Mapping[str, Mapping[str, str]]) -> None:
         assert self._file is not None
@@ -102,12 +108,13 @@ class Repeats:
         try:
             with open_below(self._file.parent, PurePath(self._file.name)) as file:
                 kept: Any = json.loads(file.read(_MAX_BYTES))
+            same = kept.pop(_BOOT, {}).get(_BOOT) == self._boot
             return {
-                str(name): {str(key): str(digest) for key, digest in digests.items()}
+                str(name): {str(key): str(digest) for key, digest in digests.items() if same or key.isdigit()}
                 for name, digests in kept.items()
             }
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError, AttributeError, RecursionError) as error:
+        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
             _log.warning("%s: cannot be read, so latched messages may be stored again: %s", self._file, error)
             return {}

@@ -341,11 +341,29 @@ def test_the_memory_is_written_once_its_messages_are_in_the_queue(tmp_path: Path
     assert not (tmp_path / "queue.db.latched").exists()
     clock.advance(0.2)
     repeats.tick()
-    assert list(json.loads((tmp_path / "queue.db.latched").read_text())) == ["s /t"]
+    assert list(json.loads((tmp_path / "queue.db.latched").read_text())) == ["boot", "s /t"]
     again = Repeats(queue, clock)
     assert again.of("s", "/t").came_before("1", b"one")
     assert not again.of("s", "/t").came_before("1", b"two")
     assert not again.of("other", "/t").came_before("1", b"one")
+
+
+def test_a_publisher_of_ros_1_is_another_one_after_a_boot(tmp_path: Path) -> None:
+    boots = [tmp_path / "first", tmp_path / "second", tmp_path / "missing"]
+    for boot in boots[:2]:
+        boot.write_text(f"{boot.name}\n")
+
+    def repeats(boot: Path) -> Repeats:
+        return Repeats(tmp_path / "queue.db", ManualClock(), boot)
+
+    first = repeats(boots[0])
+    for key in ("/map_server", "1700000000000000000"):
+        first.of("s", "/t").came_before(key, b"map")
+    first.write()
+    for boot, known in zip(boots, (True, False, False), strict=True):
+        again = repeats(boot).of("s", "/t")
+        assert again.came_before("/map_server", b"map") is known
+        assert again.came_before("1700000000000000000", b"map")
 
 
 def test_a_message_that_comes_while_another_settles_waits_for_its_own_time(tmp_path: Path) -> None:
