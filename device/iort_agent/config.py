@@ -25,6 +25,7 @@ from iort_agent.errors import ConfigError
 from iort_agent.files.folder import FilesConfig
 from iort_agent.lanes import LiveConfig, PingConfig, RecordConfig
 from iort_agent.metrics import MetricsConfig
+from iort_agent.recorder.config import RecorderConfig
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
 from iort_agent.spool import QueueConfig, default_path
@@ -57,6 +58,7 @@ class Config:
     ping: PingConfig = setting(section(PingConfig), PingConfig())
     queue: QueueConfig = setting(section(QueueConfig), QueueConfig())
     files: FilesConfig = setting(section(FilesConfig), FilesConfig())
+    recorder: RecorderConfig | None = setting(section(RecorderConfig), None)
     metrics: MetricsConfig = setting(section(MetricsConfig), MetricsConfig())
     downlink: DownlinkConfig = setting(section(DownlinkConfig), DownlinkConfig())
     motion: MotionState = setting(section(MotionState), MotionState())
@@ -74,6 +76,10 @@ def load_config(file: Path) -> Config:
     config = load(Config, content, place)
     if config.queue.path is None:
         config = replace(config, queue=replace(config.queue, path=default_path(file, config.robot)))
+    if config.recorder is not None and config.recorder.folder is None:
+        assert config.queue.path is not None, "as above"
+        folder = config.queue.path.with_suffix(".ring")
+        config = replace(config, recorder=replace(config.recorder, folder=folder))
     try:
         config.downlink.check_topics()
         config.downlink.graph(config.sources)
@@ -98,6 +104,7 @@ def without_sources(config: Config) -> Config:
     return replace(
         config,
         sources=(),
+        recorder=None,
         share=(),
         downlink=DownlinkConfig(),
         ping=PingConfig(),
