@@ -79,19 +79,17 @@ _COMPARE = {ast.Eq: "==", ast.NotEq: "!=", ast.Lt: "<", ast.LtE: "<=", ast.Gt: "
 
 def parse(expression: str) -> Node:
     """Parse an expression; raises `ExpressionError` if it is not in the language."""
+    return Reader(one_line(expression)).parse()
+
+
+def one_line(expression: str) -> str:
+    """The expression as one line, since for Python leading spaces are indentation and a newline ends it.
+
+    Raises `ExpressionError` if it is too long.
+    """
     if len(expression) > MAX_LENGTH:
         raise ExpressionError(f"must be at most {MAX_LENGTH} characters", expression[:60] + "...", 0)
-    # For Python, leading spaces are indentation, and a newline ends the expression.
-    text = " ".join(expression.splitlines()).strip()
-    try:
-        tree = ast.parse(text, mode="eval")
-    except SyntaxError as error:
-        # The position is the end of the text.
-        position = min(len(text), (error.offset or len(text) + 1) - 1)
-        raise ExpressionError(f"invalid expression: {error.msg}", text, position) from error
-    except (ValueError, MemoryError, RecursionError) as error:
-        raise ExpressionError("invalid expression", text[:60], 0) from error
-    return _Reader(text).read(tree.body)
+    return " ".join(expression.splitlines()).strip()
 
 
 def names(node: Node) -> frozenset[str]:
@@ -139,11 +137,21 @@ def holds(node: Node, columns: Mapping[str, Sequence[Value]], n: int) -> list[bo
     Raises `MismatchError` if the condition mixes numbers and texts.
     """
     fields = {name: columns.get(name) or [None] * n for name in names(node)}
-    kinds = {name: frozenset(map(_kind, column)) - {_NULL} for name, column in fields.items()}
-    if problem := _mismatch(node, kinds):
+    known = {name: kinds(*column) for name, column in fields.items()}
+    if problem := mismatch(node, known):
         raise MismatchError(problem)
     samples = ({name: column[i] for name, column in fields.items()} for i in range(n))
     return [bool(evaluate(node, sample, _PLAIN)) for sample in samples]
+
+
+def true(node: Node, values: Mapping[str, Value]) -> bool:
+    """Whether the condition is true with the values of its fields, whose kinds were checked."""
+    return bool(evaluate(node, values, _PLAIN))
+
+
+def kinds(*of: Value) -> frozenset[str]:
+    """The kinds of values, without null's."""
+    return frozenset(map(_kind, of)) - {_NULL}
 
 
 def _calculated(symbol: str, left: Value, right: Value) -> float | None:
@@ -180,17 +188,17 @@ def _kinds(node: Node, of: _Kinds) -> frozenset[str]:
     return frozenset({_kind(node.value) if node.kind == CONSTANT else _NUMBER})
 
 
-def _mismatch(node: Node, of: _Kinds) -> str:
+def mismatch(node: Node, of: _Kinds) -> str:
     """The error text if the condition mixes numbers and texts of these kinds; empty if it does not."""
-    kinds = frozenset().union(*(_kinds(part, of) for part in node.of))
+    found = frozenset().union(*(_kinds(part, of) for part in node.of))
     said = ", ".join(
         f"{_shown(part)} is {' or '.join(sorted(_kinds(part, of)))}" for part in node.of if _kinds(part, of)
     )
-    if node.kind in COMPARISONS and len(kinds) > 1:
+    if node.kind in COMPARISONS and len(found) > 1:
         return f"cannot compare a number with a text: {said}"
-    if (node.kind in ARITHMETIC or node.kind == MAGNITUDE) and _TEXT in kinds:
+    if (node.kind in ARITHMETIC or node.kind == MAGNITUDE) and _TEXT in found:
         return f"cannot calculate with a text: {said}"
-    return next(filter(None, (_mismatch(part, of) for part in node.of)), "")
+    return next(filter(None, (mismatch(part, of) for part in node.of)), "")
 
 
 def _shown(node: Node) -> str:
@@ -199,17 +207,37 @@ def _shown(node: Node) -> str:
     return repr(node.value) if node.kind == CONSTANT else "the result"
 
 
-class _Reader:
-    """Turns Python's tree into ours; refuses everything outside our language."""
+class Reader:
+    """Turns Python's tree into ours; refuses everything outside our language.
 
-    def __init__(self, text: str) -> None:
-        self._text = text
+    ``functions`` names the language's functions in an error. ``source`` is what Python parses: the text, or
+    one of the same length if the language has tokens that Python does not have.
+    """
+
+    functions = "the only function is abs(x)"
+
+    def __init__(self, text: str, source: str | None = None) -> None:
+        self.text = text
+        self._source = text if source is None else source
         self._depth = 0
+
+    def parse(self) -> Node:
+        """The tree of the text; raises `ExpressionError`."""
+        text = self.text
+        try:
+            tree = ast.parse(self._source, mode="eval")
+        except SyntaxError as error:
+            # The position is the end of the text.
+            position = min(len(text), (error.offset or len(text) + 1) - 1)
+            raise ExpressionError(f"invalid expression: {error.msg}", text, position) from error
+        except (ValueError, MemoryError, RecursionError) as error:
+            raise ExpressionError("invalid expression", text[:60], 0) from error
+        return self.read(tree.body)
 
     def read(self, node: ast.expr) -> Node:
         self._depth += 1
         if self._depth > _MAX_DEPTH:
-            raise self._error("the expression is nested too deeply", node)
+            raise self.error("the expression is nested too deeply", node)
         try:
             return self._read(node)
         finally:
@@ -217,13 +245,13 @@ class _Reader:
 
     def _read(self, node: ast.expr) -> Node:
         if isinstance(node, (ast.Name, ast.Attribute, ast.Subscript)):
-            return self._field(node)
+            return self.field(node)
         if isinstance(node, ast.Constant):
             return self._constant(node)
         step = self._operation(node)
         # The kinds of fields are known only with the samples.
-        if problem := _mismatch(step, {}):
-            raise self._error(problem, node)
+        if problem := mismatch(step, {}):
+            raise self.error(problem, node)
         return step
 
     def _operation(self, node: ast.expr) -> Node:
@@ -242,11 +270,11 @@ class _Reader:
         if isinstance(node, ast.Compare):
             return self._compare(node)
         if isinstance(node, ast.Call):
-            return self._call(node)
-        raise self._error("not part of the language: fields, numbers, texts, + - * / %, "
+            return self.call(node)
+        raise self.error("not part of the language: fields, numbers, texts, + - * / %, "
                           "abs(), comparisons, and, or, not", node)  # fmt: skip
 
-    def _field(self, node: ast.expr) -> Node:
+    def field(self, node: ast.expr) -> Node:
         path: list[str] = []
         at = node
         while not isinstance(at, ast.Name):
@@ -254,26 +282,26 @@ class _Reader:
                 path.append(at.attr)
             elif isinstance(at, ast.Subscript) and isinstance(at.slice, ast.Constant):
                 if type(at.slice.value) is not int:
-                    raise self._error("an index must be a number", at.slice)
+                    raise self.error("an index must be a number", at.slice)
                 path.append(str(at.slice.value))
             else:
-                raise self._error("not a field", node)
+                raise self.error("not a field", node)
             at = at.value
         name = ".".join([at.id, *reversed(path)])
         try:
             return Node(FIELD, value=check_field(name))
         except ContractError as error:
-            raise self._error(str(error), node) from error
+            raise self.error(str(error), node) from error
 
     def _constant(self, node: ast.Constant) -> Node:
         value = node.value
         if value is None:
-            raise self._error("None is only allowed as x is None, x is not None", node)
+            raise self.error("None is only allowed as x is None, x is not None", node)
         if not isinstance(value, (bool, int, float, str)):
-            raise self._error("must be a number or a text", node)
+            raise self.error("must be a number or a text", node)
         # An integer may be larger than every float.
         if not isinstance(value, str) and not abs(value) <= sys.float_info.max:
-            raise self._error("the number is too large", node)
+            raise self.error("the number is too large", node)
         return Node(CONSTANT, value=value)
 
     def _compare(self, node: ast.Compare) -> Node:
@@ -283,27 +311,38 @@ class _Reader:
 
     def _pair(self, left: ast.expr, kind: ast.cmpop, right: ast.expr) -> Node:
         if isinstance(kind, (ast.Is, ast.IsNot)) and not _is_none(right):
-            raise self._error("`is` only works with None; use ==", right)
+            raise self.error("`is` only works with None; use ==", right)
         if isinstance(kind, (ast.Is, ast.IsNot, ast.Eq, ast.NotEq)) and (_is_none(left) or _is_none(right)):
             null = Node(IS_NULL, (self.read(left if _is_none(right) else right),))
             return null if isinstance(kind, (ast.Is, ast.Eq)) else Node(NOT, (null,))
         if type(kind) in _COMPARE:
             return Node(_COMPARE[type(kind)], (self.read(left), self.read(right)))
         if not isinstance(right, (ast.Tuple, ast.List)) or not right.elts:
-            raise self._error("`in` needs values in brackets, such as in (1, 2)", right)
+            raise self.error("`in` needs values in brackets, such as in (1, 2)", right)
         within = Node(SOME, tuple(self._pair(left, ast.Eq(), item) for item in right.elts))
         return within if isinstance(kind, ast.In) else Node(NOT, (within,))
 
-    def _call(self, node: ast.Call) -> Node:
+    def call(self, node: ast.Call) -> Node:
         known = isinstance(node.func, ast.Name) and node.func.id == "abs"
         if not known or len(node.args) != 1 or node.keywords:
-            raise self._error("the only function is abs(x)", node)
+            raise self.error(self.functions, node)
         return Node(MAGNITUDE, (self.read(node.args[0]),))
 
-    def _error(self, problem: str, node: ast.expr) -> ExpressionError:
+    def error(self, problem: str, node: ast.expr) -> ExpressionError:
+        return ExpressionError(problem, self.text, self.position(node))
+
+    def position(self, node: ast.expr) -> int:
+        """Where the node begins in the text."""
+        return self._characters(node.col_offset)
+
+    def said(self, node: ast.expr) -> str:
+        """The text of a node."""
+        end = node.end_col_offset
+        return self.text[self.position(node) : None if end is None else self._characters(end)]
+
+    def _characters(self, offset: int) -> int:
         # ast counts bytes of UTF-8.
-        position = len(self._text.encode()[: node.col_offset].decode(errors="ignore"))
-        return ExpressionError(problem, self._text, position)
+        return len(self.text.encode()[:offset].decode(errors="ignore"))
 
 
 def _is_none(node: ast.expr) -> bool:

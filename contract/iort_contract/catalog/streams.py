@@ -10,6 +10,7 @@ from iort_contract.topics import PING_PATHS
 
 RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM = "rtt", "agent", "types", "account"
 LOG_STREAM, POSE_STREAM, DRIVE_STREAM = "log", "pose", "drive"
+INCIDENT_STREAM = "incidents"
 # One sample per pong, with null in the other paths' fields.
 RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
 
@@ -92,6 +93,29 @@ CATALOG = {
                     "motion",
                     label="Steering asked for",
                 ),
+            ),
+            own=True,
+        ),
+        Stream(
+            INCIDENT_STREAM,
+            "what the event recorder has kept; a sample at each change, and the newest of an id holds",
+            (
+                Field("id", "", "the incident, in hexadecimal"),
+                Field("trigger", "", "the triggers that fired, with commas; `take` for an operator's"),
+                Field("condition", "", "the condition of the first of them"),
+                Field("why", "", "the values at the edge, the operator's reason, or why nothing is kept"),
+                Field("from_us", "us", "the begin of the window", label="From"),
+                Field("to_us", "us", "the end of the window", label="To"),
+                Field(
+                    "state",
+                    "",
+                    "`kept` on the robot, `uploaded`, `notified` (only told), `over_budget`, or `lost`",
+                ),
+                Field("key", "", "the file in the bucket; empty before it is there", label="File"),
+                Field("bytes", "bytes", "the size of the file", label="Size"),
+                Field("messages", "messages", "messages in the file"),
+                Field("missing", "messages", "messages of the window that are known not to be in the file"),
+                Field("by", "", "the operator who took it, as they say"),
             ),
             own=True,
         ),

@@ -11,6 +11,13 @@ from iort_contract.checks import check_field, shown
 from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ, ContractError
 from iort_contract.messages.commands import DriveLimits, decode_limits, encode_limits
 from iort_contract.messages.envelope import read
+from iort_contract.messages.recorder import (
+    RECORDER,
+    Wanted,
+    decode_answers,
+    decode_wanted,
+    encode_answers,
+)
 from iort_contract.tables import AGENT_VERSION, OVER_SHARE
 from iort_contract.topics import COMMANDS, check_stream
 
@@ -156,12 +163,13 @@ class StopNotes(NamedTuple):
 
 @dataclass(frozen=True)
 class Desired:
-    """The desired settings by name, the cloud's notice, and who asked for the emergency stop. The settings
-    are not checked."""
+    """The desired settings by name, the cloud's notice, who asked for the emergency stop, and what the
+    recorder is to keep. The settings and the recorder's part are not checked."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     over_share: OverShare | None = None
     stops: StopNotes = field(default_factory=StopNotes)
+    recorder: Wanted = field(default_factory=Wanted)
 
     @property
     def stopped_alone(self) -> bool:
@@ -174,7 +182,7 @@ class Desired:
 class Reported:
     """The settings in force and the rejected ones, by name; the newest outcome of each command; what a stick
     drives, if the robot can be driven by hand. ``moves`` tells whether it has a motion that a stop ends; None
-    of an agent that does not say so."""
+    of an agent that does not say so. ``recorder`` has the answer to each trigger: accepted, or why not."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     rejected: Mapping[str, Rejection] = field(default_factory=dict)
@@ -182,6 +190,7 @@ class Reported:
     agent_version: str = ""
     drive: DriveLimits | None = None
     moves: bool | None = None
+    recorder: Mapping[str, str] = field(default_factory=dict)
 
 
 def decode_desired(document: Any) -> Desired:
@@ -191,6 +200,7 @@ def decode_desired(document: Any) -> Desired:
     return Desired(
         over_share=_counted(OverShare, sections.pop(OVER_SHARE, None)),
         stops=StopNotes(*(_counted(Pressed, notes.get(name)) for name in StopNotes._fields)),
+        recorder=decode_wanted(sections.pop(RECORDER, None)),
         settings=dict(_flat(sections)),
     )
 
@@ -221,6 +231,7 @@ def decode_reported(document: Any) -> Reported:
     version = sections.pop(AGENT_VERSION, "")
     drive = decode_limits(sections.pop(DRIVE, None))
     moves = sections.pop(MOVES, None)
+    recorder = decode_answers(sections.pop(RECORDER, None))
     return Reported(
         dict(sorted(_flat(sections))),
         _each_valid(Rejection, dict(sorted(rejected.items()))),
@@ -228,6 +239,7 @@ def decode_reported(document: Any) -> Reported:
         version if isinstance(version, str) else "",
         drive,
         moves if isinstance(moves, bool) else None,
+        recorder,
     )
 
 
@@ -241,6 +253,7 @@ def encode_reported(reported: Reported) -> dict[str, Any]:
         AGENT_VERSION: reported.agent_version,
         DRIVE: encode_limits(reported.drive),
         MOVES: reported.moves,
+        RECORDER: encode_answers(reported.recorder),
     }
 
 
