@@ -35,6 +35,7 @@ class RosType:
 
     def __init__(self, topic: str, kind: str, md5sum: str, definition: str) -> None:
         self.id = type_id(topic, kind, md5sum)
+        self.topic, self.name, self.md5sum, self.definition = topic, kind, md5sum, definition
         self.ros2 = is_ros2(kind)
         self.decoder: Decoder | None = None
         self.layout = kind if self.ros2 else ""
@@ -63,10 +64,11 @@ class RosMessage(Mapping[str, Value]):
     """A serialized message that reads like its flat sample; it is decoded on first use.
 
     ``large`` are the bytes of its ``uint8[]`` fields, to be stored elsewhere; ``beside`` are fields of the
-    sample that are not in the message, such as the place of those bytes.
+    sample that are not in the message, such as the place of those bytes. ``arrival_us`` is when it came, by
+    the receiver's clock; 0 if nobody knows.
     """
 
-    __slots__ = ("_values", "beside", "kind", "large", "raw")
+    __slots__ = ("_values", "arrival_us", "beside", "kind", "large", "raw")
 
     def __init__(
         self,
@@ -75,9 +77,11 @@ class RosMessage(Mapping[str, Value]):
         *,
         large: Mapping[str, Large] | None = None,
         beside: Mapping[str, Value] | None = None,
+        arrival_us: int = 0,
     ) -> None:
         self.raw = raw
         self.kind = kind
+        self.arrival_us = arrival_us
         self.large = large or {}
         self.beside = beside or {}
         self._values: Mapping[str, Value] | None = None

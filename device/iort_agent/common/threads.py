@@ -92,6 +92,7 @@ THREADS = {
     "guard": Kind(longest_s=1.0),
     "pings": Kind(),
     "record": Kind(longest_s=1.0),
+    "ring": Kind(longest_s=1.0),
     # rospy cannot be begun anew in the middle of anything.
     "ros1 node": Kind(END),
     "ros2 node": Kind(END),

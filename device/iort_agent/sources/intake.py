@@ -10,7 +10,7 @@ import logging
 import threading
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Callable, Mapping, NamedTuple, Optional
+from typing import Any, Callable, Dict, Mapping, NamedTuple, Optional
 
 from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.schema import choice, items, setting, text
@@ -62,6 +62,12 @@ class TopicConfig:
     )
 
 
+class Selected(Dict[str, Any]):
+    """The selected fields of a message; ``whole`` is the message, for an `Emit` that ``keeps_whole``."""
+
+    whole: RosMessage | None = None
+
+
 class Kind(NamedTuple):
     """A type of the topic's messages. ``decoder`` is for selected fields, and for bytes that are stored
     elsewhere."""
@@ -92,6 +98,7 @@ class Intake:
         self._config = config
         self._large = large == UPLOAD
         self._emit = emit
+        self._keeps_whole = getattr(emit, "keeps_whole", False)
         self._clock = clock
         self._header: Mapping[str, str] | None = None
         # Publisher -> its connection, whose type has been sent.
@@ -167,7 +174,10 @@ class Intake:
             t_ns = stamp_ns(data, ros2=kind.ros2)
             t_us = None if t_ns is None else t_ns // 1000
         whole = kind.whole if kind.decoder is None else None
-        values = RosMessage(data, whole) if whole is not None else self._sample(kind, data)
+        if whole is not None:
+            values: Mapping[str, Value] | None = RosMessage(data, whole, arrival_us=arrival_us)
+        else:
+            values = self._sample(kind, data, arrival_us)
         if t_us is None or self.sim_time or not -BELIEVABLE_US < t_us - arrival_us < BELIEVABLE_US:
             if time != ARRIVAL:
                 self._warn_of_stamp(t_us, arrival_us)
@@ -214,7 +224,7 @@ class Intake:
         self._decoders = [*self._decoders[-_MAX_KINDS:], decoder]
         return decoder
 
-    def _sample(self, kind: Kind, data: bytes) -> Mapping[str, Value] | None:
+    def _sample(self, kind: Kind, data: bytes, arrival_us: int) -> Mapping[str, Value] | None:
         """The message, or the selected fields."""
         values: dict[str, Any] = {}
         if kind.decoder is not None:
@@ -227,11 +237,15 @@ class Intake:
                 self.warn("undecodable", f"kept as it is: {error}")
         if kind.decoder is None or not self._config.fields:
             contents = {name: value for name, value in values.items() if isinstance(value, Large) and value}
-            return RosMessage(data, kind.whole, large=contents)
+            return RosMessage(data, kind.whole, large=contents, arrival_us=arrival_us)
         if not values:
             self.warn("empty", "its messages have no field to send")
             return None
-        return values
+        if not self._keeps_whole:
+            return values
+        selected = Selected(values)
+        selected.whole = RosMessage(data, kind.whole, arrival_us=arrival_us)
+        return selected
 
     def _came_before(self, header: Mapping[str, str], data: bytes, source_ns: int) -> bool:
         """Whether a latching publisher repeats the message to a new connection: old data, whatever its
