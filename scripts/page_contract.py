@@ -15,7 +15,14 @@ from iort_contract.catalog import vesc
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.entries import Derived, Field
 from iort_contract.catalog.metrics import METRICS
-from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM, ROS_UNITS
+from iort_contract.catalog.streams import (
+    CATALOG,
+    DRIVE_STREAM,
+    INCIDENT_STREAM,
+    LOG_STREAM,
+    POSE_STREAM,
+    ROS_UNITS,
+)
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
 from iort_contract.messages import analysis, commands, insights, live, page
 from iort_contract.messages.files import ATTACHMENT_FIELDS
@@ -23,7 +30,7 @@ from iort_contract.messages.files import ATTACHMENT_FIELDS
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
 _ATOM = 3
 # Their fields have names that other streams use for something else.
-_NAMED = (POSE_STREAM, LOG_STREAM, DRIVE_STREAM)
+_NAMED = (POSE_STREAM, LOG_STREAM, DRIVE_STREAM, INCIDENT_STREAM)
 
 
 class Symbol:
@@ -104,6 +111,7 @@ def _constants() -> Iterator[str]:
     yield f"export const POSE_STREAM = {json.dumps(POSE_STREAM)};"
     yield f"export const LOG_STREAM = {json.dumps(LOG_STREAM)};"
     yield f"export const DRIVE_STREAM = {json.dumps(DRIVE_STREAM)};"
+    yield f"export const INCIDENT_STREAM = {json.dumps(INCIDENT_STREAM)};"
     yield f"export const REFUSALS = {json.dumps(commands.REFUSALS, indent=2)} as const;"
     yield f"export const TEMPERATURES = {json.dumps(TEMPERATURES)} as const;"
     yield f"export const ATTACHMENT_PARTS = {json.dumps(list(ATTACHMENT_FIELDS))} as const;"

@@ -36,6 +36,7 @@ export const INVITATION = "key";
 export const POSE_STREAM = "pose";
 export const LOG_STREAM = "log";
 export const DRIVE_STREAM = "drive";
+export const INCIDENT_STREAM = "incidents";
 export const REFUSALS = {
   "driven_by_another": "another session drives; begin a new one that takes over",
   "emergency_stop": "the robot is stopped until somebody releases it",
@@ -142,6 +143,20 @@ export const FIELD_TABLE: FieldTable = {
       "lease_left_ms": { "unit": "ms", "meaning": "how long the driver's lease still holds", "label": "Lease left" },
       "speed": { "unit": "m/s", "meaning": "the speed that the robot was told; null if refused", "label": "Speed asked for" },
       "steering": { "unit": "rad", "meaning": "the steering angle that it was told", "label": "Steering asked for" }
+    },
+    "incidents": {
+      "id": { "unit": "", "meaning": "the incident, in hexadecimal" },
+      "trigger": { "unit": "", "meaning": "the triggers that fired, with commas; `take` for an operator's" },
+      "condition": { "unit": "", "meaning": "the condition of the first of them" },
+      "why": { "unit": "", "meaning": "the values at the edge, the operator's reason, or why nothing is kept" },
+      "from_us": { "unit": "us", "meaning": "the begin of the window", "label": "From" },
+      "to_us": { "unit": "us", "meaning": "the end of the window", "label": "To" },
+      "state": { "unit": "", "meaning": "`kept` on the robot, `uploaded`, `notified` (only told), `over_budget`, or `lost`" },
+      "key": { "unit": "", "meaning": "the file in the bucket; empty before it is there", "label": "File" },
+      "bytes": { "unit": "bytes", "meaning": "the size of the file", "label": "Size" },
+      "messages": { "unit": "messages", "meaning": "messages in the file" },
+      "missing": { "unit": "messages", "meaning": "messages of the window that are known not to be in the file" },
+      "by": { "unit": "", "meaning": "the operator who took it, as they say" }
     }
   },
   "ros_units": {

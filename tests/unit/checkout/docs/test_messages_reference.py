@@ -13,7 +13,13 @@ from awsiot import iotidentity
 from functions.echo import pong
 from iort_agent.control.shadow import overlay
 from iort_agent.lanes import RuntimeSettings
-from iort_contract.catalog.streams import CATALOG, DRIVE_STREAM, LOG_STREAM, POSE_STREAM
+from iort_contract.catalog.streams import (
+    CATALOG,
+    DRIVE_STREAM,
+    INCIDENT_STREAM,
+    LOG_STREAM,
+    POSE_STREAM,
+)
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
@@ -60,6 +66,15 @@ from iort_contract.messages.questions import (
     encode_answer,
     encode_ask,
 )
+from iort_contract.messages.recorder import (
+    EVENTS,
+    Trigger,
+    decode_take,
+    decode_trigger,
+    encode_take,
+    encode_trigger,
+    incident,
+)
 from iort_contract.messages.shadow import CHANGEABLE, decode_desired, decode_reported, encode_reported
 from iort_contract.ros.message import MessageType, message_type
 from iort_contract.tables import (
@@ -71,6 +86,7 @@ from iort_contract.tables import (
     SERIAL_PARAMETER,
 )
 from iort_contract.topics import ACCEPTED, build_topic
+from iort_contract.triggers import check_trigger
 from iort_station.fleet.control import State, outcome
 from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
@@ -157,8 +173,8 @@ SAMPLES: dict[str, accounts.Account | MessageType] = {
         "imu", "/imu", "sensor_msgs/Imu", "6a62c6daae103f4ff57a132d6f95cec2", "Header header\n"
     ),
 }
-STREAMS = (LOG_STREAM, DRIVE_STREAM, POSE_STREAM)
-SHADOW = ("desired", "reported")
+STREAMS = (LOG_STREAM, DRIVE_STREAM, POSE_STREAM, INCIDENT_STREAM)
+SHADOW = ("desired", "triggers", "reported")
 PROVISIONING = ("csr", "certificate", "register", "registered", "denied")
 
 
@@ -294,6 +310,21 @@ def test_the_agent_reads_and_writes_the_shadows_documents_of_the_page() -> None:
     desired, reported_keys = section("## The shadow").split("<!-- example: reported -->")
     assert {name for row in rows(desired) for name in named(row[0])} == set(CHANGEABLE)
     assert {name for row in rows(reported_keys) for name in named(row[0])} == example.keys()
+
+
+def test_the_recorder_reads_and_writes_the_triggers_of_the_page() -> None:
+    wanted = decode_desired(EXAMPLES["triggers"]).recorder
+    for name, content in wanted.triggers.items():
+        trigger = check_trigger(decode_trigger(name, content))
+        written = json.loads(json.dumps(encode_trigger(trigger)))["recorder"]["triggers"][name]
+        assert {key: value for key, value in written.items() if value is not None} == content
+    for name, content in wanted.takes.items():
+        written = encode_take(decode_take(name, content), {})["recorder"]["takes"][name]
+        assert {key: value for key, value in written.items() if value is not None} == content
+    table = section("## The shadow").split("<!-- example: triggers -->")[1]
+    assert {name for row in rows(table) for name in named(row[0])} == vars(Trigger("a")).keys() - {"name"}
+    assert all(f"`{event}`" in table for event in EVENTS)
+    assert incident(EXAMPLES["incidents"]).state == "uploaded"
 
 
 def test_the_messages_of_provisioning_equal_those_of_awss_client() -> None:
