@@ -112,7 +112,13 @@ class Agent:
                 source,
                 clock,
                 queue=config.queue.path,
-                taken=[name for other in config.sources if other is not source for name in other.streams()],
+                taken=[
+                    name
+                    for other in config.sources
+                    if other is not source
+                    for name in (*other.streams(), *other.only_ring())
+                ],
+                whole=config.recorder is not None,
             )
             for source in config.sources
         ]

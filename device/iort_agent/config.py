@@ -28,6 +28,7 @@ from iort_agent.metrics import MetricsConfig
 from iort_agent.recorder.config import RecorderConfig
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
+from iort_agent.sources.ros import RosConfig
 from iort_agent.spool import QueueConfig, default_path
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
@@ -90,6 +91,13 @@ def load_config(file: Path) -> Config:
     except ContractError as error:
         raise place.child("downlink.drive").problem(str(error)) from error
     _check_streams(config, place.child("sources"))
+    for i, source in enumerate(config.sources):
+        if config.recorder is None and isinstance(source, RosConfig) and source.has_ring():
+            raise (
+                place.child("sources")
+                .item(i)
+                .problem("`only: ring` needs the section recorder, whose ring it means")
+            )
     if config.files.large_folder is None and any(source.uploads_large() for source in config.sources):
         raise place.child("files.large_folder").problem(
             "required, and missing: a source says `large: upload`, and its contents wait in this folder"
@@ -117,7 +125,11 @@ def _check_streams(config: Config, place: Place) -> None:
     # A car whose commands no stick drives may record another stream of this name.
     taken: list[str] = sorted(OWN_STREAMS - ({DRIVE_STREAM} if config.downlink.drive is None else set()))
     for i, source in enumerate(config.sources):
-        for stream in source.streams():
+        both = sorted({*source.streams()} & {*source.only_ring()})
+        if both:
+            raise place.item(i).problem(f"the stream {both[0]} is recorded, and for the ring alone")
+        streams = [*source.streams(), *source.only_ring()]
+        for stream in streams:
             if stream in taken:
                 raise place.item(i).problem(f"the stream {stream} is taken: {', '.join(taken)} are in use")
-        taken += source.streams()
+        taken += streams

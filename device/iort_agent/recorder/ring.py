@@ -293,9 +293,6 @@ class Ring:
 class _Kept:
     """The `Emit` that `Ring.around` makes."""
 
-    # A source gives it the whole message with the fields that it selects of it.
-    keeps_whole = True
-
     def __init__(self, ring: Ring, emit: Emit, only: Container[str]) -> None:
         self._ring, self._emit, self._only = ring, emit, only
 

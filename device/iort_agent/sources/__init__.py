@@ -11,6 +11,8 @@ from iort_contract.limits import Value
 
 # Bytes in a message, such as an image: left out, or uploaded as a file with an attachment in the sample.
 REFUSE, UPLOAD = "refuse", "upload"
+# A topic that is heard for the event recorder's ring, and not recorded.
+RING = "ring"
 
 
 class Emit(Protocol):
@@ -59,6 +61,10 @@ class SourceConfig(Protocol):
 
     def streams(self) -> Sequence[str]:
         """The streams that it will write, as far as known beforehand; no other source may."""
+
+    def only_ring(self) -> Sequence[str]:
+        """The streams that it will give to the event recorder's ring alone, as far as known beforehand."""
+        return ()
 
     def build(self, clock: Clock) -> Source:
         """Make the source; touches neither files nor devices yet."""

@@ -63,7 +63,7 @@ class TopicConfig:
 
 
 class Selected(Dict[str, Any]):
-    """The selected fields of a message; ``whole`` is the message, for an `Emit` that ``keeps_whole``."""
+    """The selected fields of a message; ``whole`` is the message, for the event recorder."""
 
     whole: RosMessage | None = None
 
@@ -91,6 +91,7 @@ class Intake:
         clock: Clock,
         large: str = REFUSE,
         latched: Latched | None = None,
+        whole: bool = False,
     ) -> None:
         self.sim_time = False
         self.throttled = ThrottledLog(_log, clock)
@@ -98,7 +99,7 @@ class Intake:
         self._config = config
         self._large = large == UPLOAD
         self._emit = emit
-        self._keeps_whole = getattr(emit, "keeps_whole", False)
+        self._whole = whole
         self._clock = clock
         self._header: Mapping[str, str] | None = None
         # Publisher -> its connection, whose type has been sent.
@@ -241,7 +242,7 @@ class Intake:
         if not values:
             self.warn("empty", "its messages have no field to send")
             return None
-        if not self._keeps_whole:
+        if not self._whole:
             return values
         selected = Selected(values)
         selected.whole = RosMessage(data, kind.whole, arrival_us=arrival_us)

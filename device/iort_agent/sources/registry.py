@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from pathlib import Path
-from typing import Any, Mapping, Sequence
+from typing import Any, Container, Mapping, Sequence
 
 from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
@@ -14,7 +14,7 @@ from iort_agent.sources.recording import BagConfig
 from iort_agent.sources.ros import RosSource
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.sources.ros2 import Ros2Config
-from iort_agent.sources.rosbridge import RosbridgeConfig
+from iort_agent.sources.rosbridge import RosbridgeConfig, RosbridgeSource
 from iort_agent.sources.sim import SimConfig
 from iort_agent.sources.vesc import VescConfig
 
@@ -35,15 +35,26 @@ class SourceRun:
     """Builds the source of a configuration and runs it once."""
 
     def __init__(
-        self, config: SourceConfig, clock: Clock, *, queue: Path | None = None, taken: Sequence[str] = ()
+        self,
+        config: SourceConfig,
+        clock: Clock,
+        *,
+        queue: Path | None = None,
+        taken: Sequence[str] = (),
+        whole: bool = False,
     ) -> None:
         """``queue`` is the file beside which a source may keep what it must know after a restart; ``taken``
-        are the streams of the other sources."""
+        are the streams of the other sources; ``whole`` says that somebody takes whole messages."""
         self.description, self.streams = config.describe(), config.streams()
         self.recorded, self.replayed = config.recorded(), config.replayed()
         self.source = config.build(clock)
+        # The streams that are for the event recorder's ring alone.
+        self.only_ring: Container[str] = ()
+        if isinstance(self.source, (RosSource, RosbridgeSource)):
+            self.source.whole = whole
         if isinstance(self.source, RosSource):
             self.source.remember(queue, taken)
+            self.only_ring = self.source.only_ring
         self.failed = False
         self._ended = False
 

@@ -16,7 +16,7 @@ from typing import Any, Callable, Iterator, Mapping, Protocol, Sequence
 from iort_agent.common.schema import Place, choice, pairs, section, setting, text
 from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
-from iort_agent.sources import REFUSE, UPLOAD, Emit, SourceConfig, intake
+from iort_agent.sources import REFUSE, RING, UPLOAD, Emit, SourceConfig, intake
 from iort_agent.sources.intake import Intake
 from iort_agent.sources.repeats import Repeats
 from iort_contract.catalog.streams import OWN_STREAMS
@@ -60,10 +60,12 @@ def ros2_name(value: str) -> str:
 class TopicConfig(intake.TopicConfig):
     """How a topic is recorded, with ``large: upload`` to send bytes (images, point clouds) as files;
     otherwise they are left out. A name with ``*``, which stands for any characters, is a pattern of topics.
-    Without ``stream`` it is the topic's name: /sensors/imu becomes sensors-imu."""
+    Without ``stream`` it is the topic's name: /sensors/imu becomes sensors-imu. With ``only: ring`` the topic
+    is kept in the event recorder's ring, whole, and not recorded."""
 
     stream: str = setting(text(check_stream), "")
     large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
+    only: str | None = setting(choice(RING), None)
 
 
 def topics_rule(
@@ -114,11 +116,19 @@ class RosConfig(SourceConfig):
 
     def streams(self) -> Sequence[str]:
         """The streams of the topics; several topics may share one. A pattern's own are not known yet."""
-        return sorted({topic.stream for _, topic in self.topics if topic.stream})
+        return sorted({topic.stream for _, topic in self.topics if topic.stream and not topic.only})
+
+    def only_ring(self) -> Sequence[str]:
+        """The streams of the topics that are not recorded."""
+        return sorted({topic.stream for _, topic in self.topics if topic.stream and topic.only})
+
+    def has_ring(self) -> bool:
+        """Whether a topic is for the ring alone."""
+        return any(topic.only for _, topic in self.topics)
 
     def uploads_large(self) -> bool:
         """Whether a topic sends bytes as files."""
-        return any(topic.large == UPLOAD for _, topic in self.topics)
+        return any(topic.large == UPLOAD and not topic.only for _, topic in self.topics)
 
     def listed(self) -> str:
         """The topics in a few words."""
@@ -151,6 +161,10 @@ class RosSource:
         self._seen: Sequence[str] = ()
         self._queue: Path | None = None
         self._taken: frozenset[str] = OWN_STREAMS
+        # The streams that are not recorded; a pattern's come as its topics are found.
+        self.only_ring = set(config.only_ring())
+        # Whether somebody takes whole messages, whatever is selected of them.
+        self.whole = False
 
     def remember(self, queue: Path | None, taken: Sequence[str]) -> None:
         """Keep the memory of latched messages beside the queue; ``taken`` are other sources' streams."""
@@ -224,12 +238,26 @@ class RosSource:
             stream = settings.stream or stream_of(topic)
             if not settings.stream and stream in self._taken:
                 stream = f"topic-{stream}"[:_MAX_STREAM]
-            _log.info("topic %s: recorded as the stream %s", topic, stream)
+            _log.info(
+                "topic %s: %s as the stream %s", topic, "in the ring" if settings.only else "recorded", stream
+            )
             yield topic, replace(settings, stream=stream)
 
     def _add(self, topic: str, settings: Any, emit: Emit, repeats: Repeats) -> None:
         name = self._node.resolve(topic)
         latched = repeats.of(settings.stream, name)
-        intake = Intake(name, settings, emit=emit, clock=self._clock, large=settings.large, latched=latched)
+        if settings.only:
+            # Nobody reads the fields.
+            settings = replace(settings, fields=None, large=REFUSE)
+            self.only_ring.add(settings.stream)
+        intake = Intake(
+            name,
+            settings,
+            emit=emit,
+            clock=self._clock,
+            large=settings.large,
+            latched=latched,
+            whole=self.whole,
+        )
         self._intakes[topic] = intake
         self.listen(topic, settings, intake)

@@ -125,6 +125,8 @@ class RosbridgeSource:
     def __init__(self, config: RosbridgeConfig, clock: Clock, times: Times = TIMES) -> None:
         self._config = config
         self._clock = clock
+        # Whether somebody takes whole messages, whatever is selected of them.
+        self.whole = False
         self._hearings: dict[str, _Hearing] = {}
         topics = [Topic(name, topic.type, topic.throttle_ms) for name, topic in config.topics]
         self.connection = RosbridgeConnection(config.url, clock, topics=topics, listener=self, times=times)
@@ -135,7 +137,7 @@ class RosbridgeSource:
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Subscribe until ``stop`` is set. Raises `SourceError` without websocket-client."""
         for name, topic in self._config.topics:
-            taken = Intake(name, topic, emit=emit, clock=self._clock)
+            taken = Intake(name, topic, emit=emit, clock=self._clock, whole=self.whole)
             self._hearings[name] = _Hearing(taken, self._clock)
         self.connection.run(stop)
 
