@@ -144,9 +144,25 @@ def holds(node: Node, columns: Mapping[str, Sequence[Value]], n: int) -> list[bo
     return [bool(evaluate(node, sample, _PLAIN)) for sample in samples]
 
 
-def true(node: Node, values: Mapping[str, Value]) -> bool:
-    """Whether the condition is true with the values of its fields, whose kinds were checked."""
-    return bool(evaluate(node, values, _PLAIN))
+def compiled(node: Node) -> Callable[[Mapping[str, Value]], Any]:
+    """A function that evaluates a tree as `holds` does, for one sample, and faster each time. The kinds of
+    the fields are not checked."""
+    if node.kind == FIELD:
+        return operator.itemgetter(str(node.value))
+    if node.kind == CONSTANT:
+        constant = node.value
+        return lambda _fields: constant
+    parts = [compiled(part) for part in node.of]
+    if node.kind == EVERY:
+        return lambda fields: all(part(fields) for part in parts)
+    if node.kind == SOME:
+        return lambda fields: any(part(fields) for part in parts)
+    calculate = _PLAIN[node.kind]
+    if len(parts) == 1:
+        (only,) = parts
+        return lambda fields: calculate(only(fields))
+    left, right = parts
+    return lambda fields: calculate(left(fields), right(fields))
 
 
 def kinds(*of: Value) -> frozenset[str]:

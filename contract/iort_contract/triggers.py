@@ -16,10 +16,10 @@ import heapq
 import math
 import re
 from collections import deque
-from typing import Any, Iterable, Mapping, NamedTuple
+from typing import Any, Callable, Iterable, Mapping, NamedTuple
 
 from iort_contract import expression
-from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES, Vehicle, derive
+from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES, Vehicle, calculator
 from iort_contract.expression import FIELD, ExpressionError, MismatchError, Node, Reader
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.recorder import FAULT, MAX_SPAN_S, Trigger, check_limits
@@ -124,7 +124,8 @@ class Evaluator:
     def __init__(
         self, rule: Rule, stream: str, vehicle: Vehicle | None = None, others: Iterable[str] = ()
     ) -> None:
-        self.rule, self._vehicle = rule, vehicle
+        self.rule, self._true = rule, expression.compiled(rule.condition)
+        self._derived: dict[str, Callable[[Mapping[str, Value]], Value]] = {}
         self.late = 0
         # Stream -> its fields in the rule, each by the name that it has there and the name in the samples.
         self.fields: dict[str, list[tuple[str, str]]] = {}
@@ -133,9 +134,11 @@ class Evaluator:
             first, _, rest = name.partition(".")
             of, field = (first, rest) if rest and first in others else (stream, name)
             self.fields.setdefault(of, []).append((name, field))
-            missing = [] if vehicle is not None else PARAMETERS.get(field, ())
+            missing = () if vehicle is not None else PARAMETERS.get(field, ())
             if missing:
                 raise ContractError(f"{field} needs the vehicle's parameters {', '.join(missing)}")
+            if field in DERIVED:
+                self._derived[field] = calculator(field, vehicle)
         silent = frozenset(of for of, _ in rule.silences.values())
         self.streams = frozenset(self.fields) | silent
         if unused := others - self.streams:
@@ -143,9 +146,10 @@ class Evaluator:
         self._deltas: dict[str, list[tuple[str, int]]] = {}
         for name, (field, age_us) in rule.deltas.items():
             self._deltas.setdefault(field, []).append((name, age_us))
-        # The kinds of each field's values so far, and the error if the condition mixes them.
+        # The types of each field's values so far, their kinds, and the error if the condition mixes them.
+        self._types: dict[str, set[type]] = {name: set() for name in expression.names(rule.condition)}
+        self._kinds: dict[str, frozenset[str]] = dict.fromkeys(self._types, frozenset())
         self._problem = ""
-        self._kinds: dict[str, frozenset[str]] = dict.fromkeys(expression.names(rule.condition), frozenset())
         self._begin()
 
     def _begin(self) -> None:
@@ -209,9 +213,12 @@ class Evaluator:
 
     def _next_deadline(self) -> float:
         """When the condition may change without a sample."""
+        pending = self._since is not None and not self._fired
+        if not pending and not self.rule.silences:
+            return math.inf
         times = [self._last[of] + age_us for of, age_us in self.rule.silences.values() if of in self._last]
-        if self._since is not None and not self._fired:
-            times.append(self._since + self.rule.for_us)
+        if pending:
+            times.append((self._since or 0) + self.rule.for_us)
         return min((t_us for t_us in times if t_us > self._evaluated), default=math.inf)
 
     def _take(self, stream: str, t_us: int, named: Mapping[str, Value]) -> None:
@@ -227,7 +234,7 @@ class Evaluator:
         for name, (of, age_us) in self.rule.silences.items():
             values[name] = of in self._last and t_us - self._last[of] >= age_us
         self._check_kinds()
-        if not expression.true(self.rule.condition, values):
+        if not self._true(values):
             self._since, self._fired = None, False
             return None
         if self._since is None:
@@ -238,19 +245,19 @@ class Evaluator:
         return Edge(t_us, dict(values))
 
     def _check_kinds(self) -> None:
-        for name, known in self._kinds.items():
-            kind = expression.kinds(self._values[name])
-            if not kind <= known:
-                self._kinds[name] = known | kind
+        for name, known in self._types.items():
+            value = self._values[name]
+            if type(value) not in known:
+                known.add(type(value))
+                self._kinds[name] |= expression.kinds(value)
                 self._problem = expression.mismatch(self.rule.condition, self._kinds)
         if self._problem:
             raise MismatchError(self._problem)
 
     def _value(self, field: str, values: Mapping[str, Any]) -> Value:
-        if field in DERIVED and all(source in values for source in SOURCES[field]):
-            columns = {source: [_plain(values[source])] for source in SOURCES[field]}
-            if field in (derived := derive(columns, self._vehicle)):
-                return derived[field][0]
+        calculated = self._derived.get(field)
+        if calculated is not None and all(source in values for source in SOURCES[field]):
+            return calculated(values)
         return _plain(values.get(field))
 
 

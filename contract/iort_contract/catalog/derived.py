@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from itertools import repeat
-from typing import Any, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 from iort_contract.catalog.entries import Derived
 from iort_contract.limits import Value
@@ -71,6 +71,17 @@ def calculable(
             parameter in known for parameter in PARAMETERS[name]
         ):
             yield entry, {parameter: known[parameter] for parameter in PARAMETERS[name]}
+
+
+def calculator(name: str, vehicle: Vehicle | None) -> Callable[[Mapping[str, Value]], Value]:
+    """What calculates a derived field of one sample, as `derive` does; raises `KeyError` for one that this
+    vehicle does not allow. The sample has the field's sources."""
+    entry, parameters = next(
+        (found for found in calculable(SOURCES[name], vehicle) if found[0].name == name), (None, {})
+    )
+    if entry is None:
+        raise KeyError(name)
+    return lambda sample: _one(entry, {source: sample[source] for source in SOURCES[name]}, parameters)
 
 
 def derive(columns: Mapping[str, Sequence[Value]], vehicle: Vehicle | None) -> dict[str, list[Value]]:
