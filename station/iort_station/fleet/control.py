@@ -99,12 +99,16 @@ class Shadow:
     def read(self) -> State:
         return read(self.data, self.robot)
 
-    def desire(self, wanted: Mapping[str, Any]) -> None:
+    def desire(self, wanted: Mapping[str, Any], version: int = 0) -> None:
         """Set desired settings by dotted name; None returns to the file's value. An emergency stop that is
-        asked for so is nobody's, and the robot's own."""
+        asked for so is nobody's, and the robot's own. AWS refuses another ``version`` than the shadow's,
+        unless it is 0."""
         notes = {STOPS: None} if MOTION_STOPPED in wanted else {}
-        payload = json.dumps({"state": {"desired": {**nested(wanted), **notes}}})
-        self.data.update_thing_shadow(thingName=self.robot, shadowName=SHADOW, payload=payload)
+        document = {
+            "state": {"desired": {**nested(wanted), **notes}},
+            **({"version": version} if version else {}),
+        }
+        self.data.update_thing_shadow(thingName=self.robot, shadowName=SHADOW, payload=json.dumps(document))
 
     def wait(self, found: Callable[[State], _Found | None], seconds: float) -> _Found | None:
         """Wait until ``found`` returns a value for the state; None after ``seconds``."""
