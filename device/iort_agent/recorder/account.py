@@ -1,0 +1,135 @@
+"""What is missing in a window, and why: the account of completeness that an incident's file carries.
+
+The ring numbers the messages of a stream, so a gap is a loss, and tells what it dropped and why. The sources
+report what never came to the agent, such as messages that the middleware has lost; their counts are looked at
+once a second, and remembered for as long as a window may be."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, Callable, Container, Mapping, Sequence
+
+from iort_agent.recorder.ring import Drop, RingMessage
+from iort_contract.messages.account import LOST
+
+# The looks that are remembered: one a second, of which only those with news count.
+_LOOKS = 4096
+# Topic -> cause -> messages.
+Counted = Mapping[str, Mapping[str, int]]
+
+
+class Losses:
+    """What the sources say that they have lost, over the ring's time. ``since_us`` is when this began: what
+    was lost before is known to nobody."""
+
+    def __init__(self, reports: Sequence[Callable[[], Mapping[str, Any]]], now_us: int) -> None:
+        self._reports, self.since_us = reports, now_us
+        self._looks: deque[tuple[int, Counted]] = deque([(now_us, {})], maxlen=_LOOKS)
+
+    def look(self, now_us: int) -> None:
+        """Note the counts, if they have changed; called about once a second."""
+        counted: dict[str, Mapping[str, int]] = {}
+        for report in self._reports:
+            for topic, counts in dict(report()).items():
+                if isinstance(counts, Mapping) and (lost := _lost(counts)):
+                    counted[topic] = lost
+        if counted != self._looks[-1][1]:
+            self._looks.append((now_us, counted))
+
+    def between(self, from_us: int, to_us: int) -> Counted:
+        """What was lost between two times, and up to a second before and after."""
+        before: Counted = {}
+        after: Counted = self._looks[-1][1]
+        for at_us, counted in self._looks:
+            if at_us <= from_us:
+                before = counted
+            elif at_us >= to_us:
+                after = counted
+                break
+        return {
+            topic: lost
+            for topic, counts in after.items()
+            if (lost := {cause: n for cause, now in counts.items() if (n := _more(now, before, topic, cause))})
+        }
+
+
+def _more(now: int, before: Counted, topic: str, cause: str) -> int:
+    return max(0, now - before.get(topic, {}).get(cause, 0))
+
+
+def _lost(counts: Mapping[str, Any]) -> dict[str, int]:
+    """The losses in a topic's counts; some are counted by field."""
+    lost: dict[str, int] = {}
+    for cause, count in counts.items():
+        if cause in LOST:
+            count = sum(count.values()) if isinstance(count, Mapping) else count
+            if type(count) is int and count:
+                lost[cause] = count
+    return lost
+
+
+class _Topic:
+    """What came of a topic: the messages of the window, and by run the first number, the last one and how
+    many there were between them."""
+
+    def __init__(self, stream: str) -> None:
+        self.stream, self.messages = stream, 0
+        self.runs: dict[str, tuple[int, int, int]] = {}
+
+    def take(self, message: RingMessage) -> None:
+        first, last, count = self.runs.get(message.channel.run, (message.seq, message.seq, 0))
+        self.runs[message.channel.run] = min(first, message.seq), max(last, message.seq), count + 1
+
+    def gaps(self) -> int:
+        return sum(max(0, last - first + 1 - count) for first, last, count in self.runs.values())
+
+
+class Account:
+    """The account of one window, made while its messages are copied."""
+
+    def __init__(self) -> None:
+        self._topics: dict[str, _Topic] = {}
+        self.messages = self.missing = self.late_us = 0
+        # Run of the agent -> its first and last time in the window: between two runs, nobody listened.
+        self.runs: dict[str, list[int]] = {}
+
+    def take(self, message: RingMessage, *, kept: bool) -> None:
+        """Count a message; those just outside of the window tell of gaps at its ends."""
+        channel = message.channel
+        topic = self._topics.get(channel.topic)
+        if topic is None:
+            topic = self._topics[channel.topic] = _Topic(channel.stream)
+        topic.take(message)
+        topic.messages += kept
+        self.messages += kept
+        run = self.runs.setdefault(channel.run, [message.ring_us, message.ring_us])
+        run[0], run[1] = min(run[0], message.ring_us), max(run[1], message.ring_us)
+
+    def close(
+        self, drops: Sequence[Drop], losses: Counted, wanted: Callable[[str], bool]
+    ) -> dict[str, dict[str, Any]]:
+        """Each topic: its messages, and the missing ones by cause."""
+        dropped: dict[str, dict[str, int]] = {}
+        for drop in drops:
+            by_why = dropped.setdefault(drop.stream, {})
+            by_why[drop.why] = by_why.get(drop.why, 0) + drop.count
+        topics = {name: topic.stream for name, topic in self._topics.items()}
+        heard: Container[str] = set(topics.values())
+        topics.update({stream: stream for stream in dropped if stream not in heard and wanted(stream)})
+        topics.update({name: "" for name in losses if name not in topics and wanted(name)})
+        account: dict[str, dict[str, Any]] = {}
+        for name, stream in topics.items():
+            topic = self._topics.get(name) or _Topic(stream)
+            causes = dict(dropped.get(stream, {}))
+            # A gap that the ring tells no reason of: a damaged or evicted segment.
+            if (unknown := topic.gaps() - sum(causes.values())) > 0:
+                causes["not_in_ring"] = unknown
+            causes.update(losses.get(name, {}))
+            account[name] = {
+                "stream": stream,
+                "messages": topic.messages,
+                "missing": sum(causes.values()),
+                **({"why": causes} if causes else {}),
+            }
+            self.missing += sum(causes.values())
+        return account

@@ -1,0 +1,214 @@
+"""Cuts an incident from the ring into one indexed MCAP: the messages byte for byte, with their definitions.
+
+A message belongs to the window if it came in it, or by its own time is of it. The file has another name until
+it is complete and on the disk. Its metadata say why it was kept, and what is missing:
+
+- ``iort.incident``: the incident, its triggers and edges with their values, the agent and its state
+- ``iort.account``: by topic, the messages in the window, the missing ones, and why
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+from pathlib import Path
+from typing import Any, BinaryIO, Callable, Iterator, Mapping, NamedTuple, Protocol, Sequence
+
+from iort_agent.recorder.account import Account, Counted
+from iort_agent.recorder.config import NONE, ZSTD
+from iort_agent.recorder.plan import Incident
+from iort_agent.recorder.ring import Drop, RingChannel, RingMessage
+from iort_agent.sources.ros import matches
+
+INCIDENT, ACCOUNT = "iort.incident", "iort.account"
+PART = ".part"
+# A message's own time may be so much off the time at which it came, and it is looked for.
+SLACK_US = 1_000_000
+# Between two pauses: the sources' threads must not wait for this one.
+_BURST, _ROOM_EVERY = 64, 1024
+_PROFILES = {"ros1": "ros1", "cdr": "ros2"}
+_LIBRARY = "iort-agent"
+
+
+class TooLargeError(Exception):
+    """The file would be larger than it may be."""
+
+
+class Source(Protocol):
+    """What is read of a ring; see `iort_agent.recorder.ring.Ring`."""
+
+    def read(self, from_us: int, to_us: int, wanted: Sequence[str] | None) -> Iterator[RingMessage]: ...
+    def drops(self, from_us: int, to_us: int) -> Sequence[Drop]: ...
+    def since_us(self) -> int: ...
+
+
+class Cut(NamedTuple):
+    """A file that was cut: its size and SHA-256, what is in it and how much is missing; ``late_us`` is how
+    long after the window's begin the ring begins."""
+
+    size: int
+    sha256: str
+    messages: int
+    missing: int
+    late_us: int
+
+
+class _Hashed:
+    """A file that is hashed while it is written, and that does not become larger than ``limit``."""
+
+    def __init__(self, file: BinaryIO, limit: int | None) -> None:
+        self._file, self._limit = file, limit
+        self.size, self.sha256 = 0, hashlib.sha256()
+
+    def write(self, data: bytes) -> int:
+        self.size += len(data)
+        if self._limit is not None and self.size > self._limit:
+            raise TooLargeError
+        self.sha256.update(data)
+        return self._file.write(data)
+
+    def tell(self) -> int:
+        return self.size
+
+    def flush(self) -> None:
+        self._file.flush()
+
+
+class _Channels:
+    """Registers each channel of the ring once; runs of the agent share one if nothing has changed."""
+
+    def __init__(self, writer: Any) -> None:
+        self._writer = writer
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._ids: dict[tuple[object, ...], int] = {}
+        self._known: dict[int, tuple[RingChannel, int]] = {}
+
+    def id_of(self, channel: RingChannel) -> int:
+        known = self._known.get(id(channel))
+        if known is not None and known[0] is channel:
+            return known[1]
+        schema = (channel.schema, channel.schema_encoding, channel.definition)
+        if schema not in self._schemas:
+            named = bool(channel.schema or channel.definition)
+            self._schemas[schema] = (
+                self._writer.register_schema(channel.schema, channel.schema_encoding, channel.definition)
+                if named
+                else 0
+            )
+        metadata = dict(channel.metadata)
+        key = (channel.topic, channel.encoding, self._schemas[schema], tuple(sorted(metadata.items())))
+        if key not in self._ids:
+            self._ids[key] = self._writer.register_channel(
+                channel.topic, channel.encoding, self._schemas[schema], metadata
+            )
+        if len(self._known) > 4 * len(self._ids) + 64:
+            self._known.clear()
+        self._known[id(channel)] = channel, self._ids[key]
+        return self._ids[key]
+
+
+def wanted(patterns: Sequence[str]) -> Callable[[str], bool]:
+    """Whether a topic or stream fits one of the patterns; all do if there are none."""
+    return lambda name: not patterns or any(matches(pattern, name) for pattern in patterns)
+
+
+def cut(
+    ring: Source,
+    incident: Incident,
+    path: Path,
+    *,
+    compression: str,
+    limit: int | None,
+    losses: Counted,
+    pause: Callable[[], object],
+    has_room: Callable[[], object],
+) -> Cut:
+    """Write the file; it has ``.part`` after its name. ``pause`` is called often, and may raise, as
+    ``has_room`` does. Raises `TooLargeError` beyond ``limit`` bytes, and `OSError`."""
+    part = path.with_name(path.name + PART)
+    account = Account()
+    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        out = _Hashed(file, limit)
+        _write(ring, incident, out, account, compression, pause, has_room, losses)
+        file.flush()
+        os.fsync(file.fileno())
+        moment_ns = max(0, incident.edges[0].t_us) * 1000
+        os.utime(file.fileno(), ns=(moment_ns, moment_ns))
+    return Cut(out.size, out.sha256.hexdigest(), account.messages, account.missing, account.late_us)
+
+
+def _write(
+    ring: Source,
+    incident: Incident,
+    out: _Hashed,
+    account: Account,
+    compression: str,
+    pause: Callable[[], object],
+    has_room: Callable[[], object],
+    losses: Counted,
+) -> None:
+    # Optional, and asked for by the ring before.
+    mcap = importlib.import_module("mcap.writer")
+    kind = mcap.CompressionType
+    how = kind.NONE if compression == NONE else kind.ZSTD if compression == ZSTD else kind.LZ4
+    writer = mcap.Writer(out, compression=how)
+    channels = _Channels(writer)
+    from_us, to_us = incident.ring_from_us, incident.ring_to_us
+    has_room()
+    began = False
+    for i, message in enumerate(ring.read(from_us - SLACK_US, to_us + SLACK_US, incident.topics or None)):
+        if not began:
+            # rosbags opens what says that it is ROS 2's.
+            writer.start(_PROFILES.get(message.channel.encoding, ""), _LIBRARY)
+            began = True
+        kept = from_us <= message.ring_us <= to_us or incident.from_us <= message.t_us <= incident.to_us
+        account.take(message, kept=kept)
+        if kept:
+            writer.add_message(
+                channels.id_of(message.channel),
+                message.ring_us * 1000,
+                message.data,
+                message.t_us * 1000,
+                message.seq & 0xFFFFFFFF,
+            )
+        if not i % _BURST:
+            pause()
+        if not i % _ROOM_EVERY:
+            has_room()
+    if not began:
+        writer.start("", _LIBRARY)
+    topics = account.close(ring.drops(from_us, to_us), losses, wanted(incident.topics))
+    account.late_us = max(0, ring.since_us() - from_us)
+    writer.add_metadata(INCIDENT, _about(incident, account))
+    writer.add_metadata(ACCOUNT, {topic: json.dumps(counts) for topic, counts in topics.items()})
+    writer.finish()
+
+
+def _about(incident: Incident, account: Account) -> Mapping[str, str]:
+    first = incident.edges[0]
+    return {
+        "id": incident.id,
+        "trigger": ", ".join(incident.triggers),
+        "condition": incident.texts("when", " | "),
+        "why": incident.texts("why", "; "),
+        "by": incident.texts("by", ", "),
+        "edge_us": str(first.t_us),
+        "values": json.dumps(first.values),
+        "edges": json.dumps([vars(edge) for edge in incident.edges]),
+        "more_edges": str(incident.more_edges),
+        "from_us": str(incident.from_us),
+        "to_us": str(incident.to_us),
+        "ring_from_us": str(incident.ring_from_us),
+        "ring_to_us": str(incident.ring_to_us),
+        "topics": json.dumps(incident.topics),
+        "messages": str(account.messages),
+        "missing": str(account.missing),
+        # Before this the ring has nothing any more, or was not there yet.
+        "begins_late_s": f"{account.late_us / 1e6:.3f}",
+        # Each run of the agent: from its first message in the window to its last.
+        "runs": json.dumps(account.runs),
+        "agent": json.dumps(incident.agent),
+    }
