@@ -7,7 +7,7 @@ import os
 import uuid
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
-from typing import Callable, Mapping
+from typing import Any, Callable, Mapping
 
 from iort_agent.common.logs import Troubles, set_level
 from iort_agent.common.state import (
@@ -24,7 +24,7 @@ from iort_agent.common.threads import WATCH, Clock
 from iort_agent.config import Config
 from iort_agent.control.commands import Operator, refuse_commands
 from iort_agent.control.downlink import make_downlink
-from iort_agent.control.guard import StopFile
+from iort_agent.control.guard import NODES, StopFile
 from iort_agent.control.shadow import Shadow
 from iort_agent.files.folder import make_uploads
 from iort_agent.files.upload import make_uploader
@@ -38,6 +38,9 @@ from iort_agent.lanes.viewers import Viewers
 from iort_agent.metrics import Accounts, AgentMetrics, Rates
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
+from iort_agent.recorder.recorder import Recorder
+from iort_agent.ros import Graph
+from iort_agent.ros.ros1_node import DEFAULT_NODE
 from iort_agent.sources.registry import SourceRun
 from iort_agent.sources.sim import SimSource
 from iort_agent.spool import Spool
@@ -97,16 +100,6 @@ class Agent:
             clock=clock,
         )
         self.pings = Pings(link, config.ping, emit=self.streams.record, on_stamp=self.offset.add)
-        self.shadow = Shadow(
-            link,
-            base=base,
-            in_force=in_force,
-            apply=self.apply,
-            known_fields=self.streams.known_fields,
-            version=agent_version(),
-            drive=config.downlink.drive_limits(),
-            moves=config.downlink.moves(),
-        )
         self.sources = [
             SourceRun(
                 source,
@@ -122,9 +115,24 @@ class Agent:
             )
             for source in config.sources
         ]
+        graph = next((run.source.graph for run in self.sources if isinstance(run.source, SimSource)), None)
+        self.recorder = self._make_recorder(graph)
+        self.shadow = Shadow(
+            link,
+            base=base,
+            in_force=in_force,
+            apply=self.apply,
+            known_fields=self.streams.known_fields,
+            version=agent_version(),
+            drive=config.downlink.drive_limits(),
+            moves=config.downlink.moves(),
+            recorder=self.recorder,
+        )
+        if self.recorder is not None:
+            self.recorder.on_answers = self.shadow.tell
         # Folders and questions share it: the broker's answers have one handler.
         uploader = None
-        if config.files.folder or config.files.large_folder or config.downlink.ask:
+        if config.files.folder or config.files.large_folder or config.downlink.ask or self.recorder:
             uploader = make_uploader(link, root_ca=config.root_ca, rate_kb_s=config.files.rate_kb_s)
         self.downlink = make_downlink(
             config.downlink,
@@ -132,7 +140,7 @@ class Agent:
             link=link,
             boot=self.boot,
             sources=config.sources,
-            graph=next((run.source.graph for run in self.sources if isinstance(run.source, SimSource)), None),
+            graph=graph,
             offset=self.offset.known,
             operator=Operator(self.shadow.answer, self._drove(config), self.shadow.known),
             uploader=uploader,
@@ -141,7 +149,10 @@ class Agent:
         )
         if self.downlink is None:
             refuse_commands(link, self.shadow.answer)
-        self.uploads = make_uploads(config.files, uploader, clock)
+        incidents = self.recorder.uploads() if self.recorder is not None else None
+        self.uploads = make_uploads(config.files, uploader, clock, incidents)
+        if self.recorder is not None and self.uploads is not None:
+            self.recorder.incidents.on_file = self.uploads.wake
         self.attachments = make_attachments(
             config.files, robot=config.robot, clock=clock, uploads=self.uploads
         )
@@ -175,6 +186,49 @@ class Agent:
         self.viewers.apply(settings)
         self.pings.set_rate(settings.ping_rate_hz)
         self.streams.apply(settings)
+        if self.recorder is not None:
+            self.recorder.stopped(settings.motion_stopped)
+
+    def _make_recorder(self, graph: Graph | None) -> Recorder | None:
+        """The recorder of a configuration that has one. A program's service and topic are in the ROS node of
+        the sources, or in a ``graph`` that is no ROS graph."""
+        config = self.config
+        if config.recorder is None:
+            return None
+        ros = config.downlink.graph(config.sources)
+        if config.recorder.service is None and config.recorder.topic is None:
+            graph = None
+        elif graph is None or ros.node is not None:
+            graph = NODES[ros.version](ros.node or DEFAULT_NODE, self.clock)
+        return Recorder(
+            config.recorder,
+            self.clock,
+            robot=config.robot,
+            run=self.boot,
+            reserve=config.queue.max_bytes,
+            tell=lambda stream, t_us, values: self.streams.emit(stream, t_us, values, urgent=True),
+            connection=self.uplink.status,
+            reports=[source.report for source in self.sources],
+            replayed=self._replayed,
+            agent=self._state,
+            graph=graph,
+        )
+
+    def _state(self) -> dict[str, Any]:
+        """The agent at an edge, for the incident's file."""
+        connection, offset = self.uplink.status(), self.offset.estimate()
+        return {
+            "robot": self.config.robot,
+            "version": agent_version(),
+            "boot": self.boot,
+            "uptime_s": round(self.clock.monotonic() - self.began, 1),
+            "connected": connection.connected,
+            "clock_offset_ms": offset.offset_ms if offset is not None else None,
+            "clock_uncertainty_ms": offset.uncertainty_ms if offset is not None else None,
+            "backlog_batches": self.spool.backlog().batches,
+            "settings": self.shadow.settings.by_name(),
+            "alarms": _alarms(self),
+        }
 
     def _replayed(self, stream: str) -> bool:
         """Whether a stream comes from a source whose times are not now's; a recording may name no streams."""
@@ -223,6 +277,7 @@ def make_status(agent: Agent) -> Status:
         ),
         downlink=agent.downlink.report() if agent.downlink is not None else None,
         files=_files(agent),
+        recorder=agent.recorder.report() if agent.recorder is not None else None,
         clock=agent.offset.estimate(),
         pings=agent.pings.report(),
         over_share=agent.shadow.over_share,
@@ -254,6 +309,7 @@ def _files(agent: Agent) -> Files | None:
 
 def _alarms(agent: Agent) -> list[str]:
     alarms = [alarm for alarm in (agent.spool.alarm, agent.record.alarm) if alarm] + WATCH.alarms()
+    alarms += agent.recorder.alarms() if agent.recorder is not None else []
     alarms += [f"source failed: {source.description}" for source in agent.sources if source.failed]
     waits = [source.waits() for source in agent.sources]
     if agent.downlink is not None:

@@ -86,6 +86,8 @@ class Runtime:
         sources = [self._thread_of(i, source) for i, source in enumerate(agent.sources)]
         uploads = agent.uploads
         uploader = None if uploads is None else Supervised("uploads", lambda: uploads.run(uploads_stop))
+        if agent.recorder is not None:
+            agent.recorder.start()
         for thread in (record, ticker, *sources, pinger, *([uploader] if uploader is not None else [])):
             thread.start()
         if sources:
@@ -98,6 +100,8 @@ class Runtime:
         agent.pings.wake()
         for thread in (*sources, ticker, pinger):
             thread.join()
+        if agent.recorder is not None:
+            agent.recorder.close()
         agent.pings.close(_LAST_PONGS_S if drain_s is None else min(_LAST_PONGS_S, drain_s))
         agent.streams.flush()
         self._check_sources()
@@ -182,6 +186,9 @@ class Runtime:
         emit: Emit = self.agent.streams.emit
         if self.agent.attachments is not None:
             emit = self.agent.attachments.around(emit)
+        if self.agent.recorder is not None:
+            # First, so that the ring has the messages as they were published.
+            emit = self.agent.recorder.around(emit)
         return Supervised("source", lambda: self._run_source(source, emit), title=str(i))
 
     def _run_source(self, source: SourceRun, emit: Emit) -> None:

@@ -163,6 +163,8 @@ def render(status: Status) -> str:
         lines += _source(source)
     if status.files is not None:
         lines += _files(status.files)
+    if status.recorder is not None:
+        lines.append(f"recorder  {_told(status.recorder)}")
     if status.clock is not None:
         offset_ms, uncertainty_ms = status.clock.offset_ms, status.clock.uncertainty_ms
         lines.append(

@@ -143,6 +143,7 @@ class Status:
     spool: Queue
     downlink: Optional[Counts]
     files: Optional[Files]
+    recorder: Optional[Counts]
     clock: Optional[ClockOffset]
     pings: Dict[str, RoundTrips]
     over_share: Optional[OverShare]

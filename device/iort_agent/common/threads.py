@@ -90,8 +90,10 @@ THREADS = {
     # It publishes the stops.
     "downlink": Kind(longest_s=FIRST_S),
     "guard": Kind(longest_s=1.0),
+    "incidents": Kind(),
     "pings": Kind(),
     "record": Kind(longest_s=1.0),
+    "recorder": Kind(longest_s=1.0),
     "ring": Kind(longest_s=1.0),
     # rospy cannot be begun anew in the middle of anything.
     "ros1 node": Kind(END),

@@ -13,7 +13,7 @@ import logging
 import math
 import threading
 from pathlib import Path
-from typing import Any, Callable, Iterable, Mapping
+from typing import Any, Callable, Iterable, Mapping, Protocol
 
 from iort_agent.common.schema import Place, allowed, did_you_mean, items, text
 from iort_agent.errors import ConfigError, UplinkError
@@ -21,6 +21,7 @@ from iort_agent.lanes import RuntimeSettings
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.checks import check_field
 from iort_contract.messages.commands import NO_MOTION, Command, DriveLimits
+from iort_contract.messages.recorder import Wanted
 from iort_contract.messages.shadow import (
     CHANGEABLE,
     FIELD_LIST,
@@ -106,6 +107,17 @@ def _selection(stream: str, value: Any, known: Iterable[str] | None) -> tuple[st
     return names
 
 
+class Recorder(Protocol):
+    """What keeps incidents, as the shadow sees it: it is told what is wanted, and answers later."""
+
+    answers: Mapping[str, str]
+
+    def want(self, wanted: Wanted) -> None: ...
+
+
+_NO_RECORDER = "the robot has no recorder: car.yaml has no section recorder"
+
+
 class Shadow:
     """Follows the shadow and reports there. The ticker calls `tick`, the uplink all else. ``over_share`` is
     the cloud's last report of batches that it put off. ``in_force`` are the
@@ -123,7 +135,9 @@ class Shadow:
         version: str,
         drive: DriveLimits | None = None,
         moves: bool = False,
+        recorder: Recorder | None = None,
     ) -> None:
+        self._recorder = recorder
         self._base, self.settings = base, in_force or base
         self._apply = apply
         self._known_fields = known_fields
@@ -140,6 +154,7 @@ class Shadow:
         self.over_share: OverShare | None = None
         self._desired: dict[str, Any] = {}
         self._rejected: dict[str, Rejection] = {}
+        self._wanted = Wanted()
         self._answers: dict[str, Outcome] = {}
         # The reported part of the shadow, as far as known; None before it was fetched.
         self._reported: dict[str, Any] | None = None
@@ -188,6 +203,10 @@ class Shadow:
             # Names that nobody has given the robot must not fill the shadow.
             del self._answers[next(iter(self._answers))]
         self._answers[name] = Outcome(command.session, command.seq, outcome)
+        self.tell()
+
+    def tell(self) -> None:
+        """Report soon: an answer has changed. From any thread."""
         self._news = True
         self.changed.set()
 
@@ -258,6 +277,9 @@ class Shadow:
         desired = decode_desired(self._desired)
         if desired.over_share is not None:
             self._note_over_share(desired.over_share)
+        self._wanted = desired.recorder
+        if self._recorder is not None:
+            self._recorder.want(desired.recorder)
         settings, rejected = overlay(
             self._base, self.settings, desired.settings, self._known_fields(), moves=self._moves
         )
@@ -269,8 +291,7 @@ class Shadow:
             _log.info("now in force: %s", json.dumps(settings.by_name()))
             self.settings = settings
             self._apply(settings)
-        self._news = True
-        self.changed.set()
+        self.tell()
 
     def _note_over_share(self, over_share: OverShare) -> None:
         """Note that the cloud put off batches, and log it once."""
@@ -286,9 +307,17 @@ class Shadow:
             name: rejection._replace(value=_quoted(rejection.value))
             for name, rejection in self._rejected.items()
         }
-        settings = self.settings.by_name()
+        recorder = self._recorder
         return encode_reported(
-            Reported(settings, rejected, dict(self._answers), self._agent_version, self._drive, self._moves)
+            Reported(
+                self.settings.by_name(),
+                rejected,
+                dict(self._answers),
+                self._agent_version,
+                self._drive,
+                self._moves,
+                dict.fromkeys(self._wanted.triggers, _NO_RECORDER) if recorder is None else recorder.answers,
+            )
         )
 
     def _publish(self, topic: str, payload: bytes) -> None:

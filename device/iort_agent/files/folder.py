@@ -14,7 +14,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Iterator, NamedTuple
+from typing import Callable, Iterator, NamedTuple
 
 from iort_agent.common.private_files import folder_of, open_below, write_below
 from iort_agent.common.schema import FOLDER, number, path, setting
@@ -59,8 +59,19 @@ class _Done(NamedTuple):
 class Folder:
     """One folder. Only the upload's thread calls it; any thread may read `waiting`."""
 
-    def __init__(self, path: Path, *, clock: Clock, settle_s: float, remove_after_s: float | None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        clock: Clock,
+        settle_s: float,
+        remove_after_s: float | None,
+        on_uploaded: Callable[[Path, str], object] = lambda _name, _key: None,
+    ) -> None:
+        """``on_uploaded`` is called with a file's path below the folder and its key, before that is noted: if
+        the process dies meanwhile, it is called again."""
         self.path, self._clock = path, clock
+        self.on_uploaded = on_uploaded
         self._settle_s, self._remove_after_s = settle_s, remove_after_s
         # By path below the folder: its look, and since when, on the monotonic clock.
         self._seen: dict[Path, tuple[Look, float]] = {}
@@ -327,6 +338,7 @@ class Uploads:
             folder.hold(name, HELD_S)
             raise
         else:
+            folder.on_uploaded(name, key)
             self._uploaded += 1
             _log.info("files: %s is uploaded as %s", folder.path / name, key)
             folder.uploaded(name, local)
@@ -337,9 +349,11 @@ class Uploads:
         self._current_bytes = there
 
 
-def make_uploads(files: FilesConfig, uploader: Uploader | None, clock: Clock) -> Uploads | None:
-    """The uploads of a configuration that names a folder. Raises `UploadError` if ``large_folder`` cannot be
-    created."""
+def make_uploads(
+    files: FilesConfig, uploader: Uploader | None, clock: Clock, last: Folder | None = None
+) -> Uploads | None:
+    """The uploads of a configuration that names a folder; the files of the ``last`` one wait until no others
+    do. Raises `UploadError` if ``large_folder`` cannot be created."""
     folders = []
     if files.large_folder is not None:
         try:
@@ -351,6 +365,8 @@ def make_uploads(files: FilesConfig, uploader: Uploader | None, clock: Clock) ->
         folders.append(
             Folder(files.folder, clock=clock, settle_s=files.settle_s, remove_after_s=files.remove_after_s)
         )
+    if last is not None:
+        folders.append(last)
     if not folders or uploader is None:
         return None
     return Uploads(folders=folders, uploader=uploader, clock=clock)

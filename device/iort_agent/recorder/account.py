@@ -7,9 +7,9 @@ once a second, and remembered for as long as a window may be."""
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Callable, Container, Mapping, Sequence
+from typing import Any, Callable, Mapping, Sequence
 
-from iort_agent.recorder.ring import Drop, RingMessage
+from iort_agent.recorder.ring import EVERY, Drop, RingMessage
 from iort_contract.messages.account import LOST
 
 # The looks that are remembered: one a second, of which only those with news count.
@@ -46,25 +46,21 @@ class Losses:
             elif at_us >= to_us:
                 after = counted
                 break
-        return {
-            topic: lost
+        more = {
+            topic: {cause: n - before.get(topic, {}).get(cause, 0) for cause, n in counts.items()}
             for topic, counts in after.items()
-            if (lost := {cause: n for cause, now in counts.items() if (n := _more(now, before, topic, cause))})
         }
-
-
-def _more(now: int, before: Counted, topic: str, cause: str) -> int:
-    return max(0, now - before.get(topic, {}).get(cause, 0))
+        lost = {topic: {cause: n for cause, n in counts.items() if n > 0} for topic, counts in more.items()}
+        return {topic: counts for topic, counts in lost.items() if counts}
 
 
 def _lost(counts: Mapping[str, Any]) -> dict[str, int]:
     """The losses in a topic's counts; some are counted by field."""
     lost: dict[str, int] = {}
     for cause, count in counts.items():
-        if cause in LOST:
-            count = sum(count.values()) if isinstance(count, Mapping) else count
-            if type(count) is int and count:
-                lost[cause] = count
+        total = sum(count.values()) if isinstance(count, Mapping) else count
+        if cause in LOST and type(total) is int and total:
+            lost[cause] = total
     return lost
 
 
@@ -74,11 +70,13 @@ class _Topic:
 
     def __init__(self, stream: str) -> None:
         self.stream, self.messages = stream, 0
-        self.runs: dict[str, tuple[int, int, int]] = {}
+        self.runs: dict[tuple[str, str, bytes], tuple[int, int, int]] = {}
 
     def take(self, message: RingMessage) -> None:
-        first, last, count = self.runs.get(message.channel.run, (message.seq, message.seq, 0))
-        self.runs[message.channel.run] = min(first, message.seq), max(last, message.seq), count + 1
+        # Each type of a topic is numbered by itself.
+        numbered = message.channel.run, message.channel.schema, message.channel.definition
+        first, last, count = self.runs.get(numbered, (message.seq, message.seq, 0))
+        self.runs[numbered] = min(first, message.seq), max(last, message.seq), count + 1
 
     def gaps(self) -> int:
         return sum(max(0, last - first + 1 - count) for first, last, count in self.runs.values())
@@ -90,8 +88,9 @@ class Account:
     def __init__(self) -> None:
         self._topics: dict[str, _Topic] = {}
         self.messages = self.missing = self.late_us = 0
-        # Run of the agent -> its first and last time in the window: between two runs, nobody listened.
+        # Run of the agent -> its first and last time in the window, and when nobody listened between them.
         self.runs: dict[str, list[int]] = {}
+        self.pauses: list[tuple[int, int, str]] = []
 
     def take(self, message: RingMessage, *, kept: bool) -> None:
         """Count a message; those just outside of the window tell of gaps at its ends."""
@@ -106,21 +105,24 @@ class Account:
         run[0], run[1] = min(run[0], message.ring_us), max(run[1], message.ring_us)
 
     def close(
-        self, drops: Sequence[Drop], losses: Counted, wanted: Callable[[str], bool]
+        self, drops: Sequence[Drop], losses: Counted, wanted: Callable[..., bool]
     ) -> dict[str, dict[str, Any]]:
         """Each topic: its messages, and the missing ones by cause."""
         dropped: dict[str, dict[str, int]] = {}
-        for drop in drops:
-            by_why = dropped.setdefault(drop.stream, {})
-            by_why[drop.why] = by_why.get(drop.why, 0) + drop.count
         topics = {name: topic.stream for name, topic in self._topics.items()}
-        heard: Container[str] = set(topics.values())
-        topics.update({stream: stream for stream in dropped if stream not in heard and wanted(stream)})
+        for drop in drops:
+            if drop.topic == EVERY:
+                # Nobody listened: how many there were, nobody knows.
+                self.pauses.append((drop.from_us, drop.to_us, drop.why))
+            elif drop.topic in topics or wanted(drop.topic, drop.stream):
+                topics.setdefault(drop.topic, drop.stream)
+                by_why = dropped.setdefault(drop.topic, {})
+                by_why[drop.why] = by_why.get(drop.why, 0) + drop.messages
         topics.update({name: "" for name in losses if name not in topics and wanted(name)})
         account: dict[str, dict[str, Any]] = {}
         for name, stream in topics.items():
             topic = self._topics.get(name) or _Topic(stream)
-            causes = dict(dropped.get(stream, {}))
+            causes = dict(dropped.get(name, {}))
             # A gap that the ring tells no reason of: a damaged or evicted segment.
             if (unknown := topic.gaps() - sum(causes.values())) > 0:
                 causes["not_in_ring"] = unknown

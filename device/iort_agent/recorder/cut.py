@@ -13,14 +13,16 @@ import hashlib
 import importlib
 import json
 import os
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, Callable, Iterator, Mapping, NamedTuple, Protocol, Sequence
 
 from iort_agent.recorder.account import Account, Counted
 from iort_agent.recorder.config import NONE, ZSTD
+from iort_agent.recorder.ledger import fits
 from iort_agent.recorder.plan import Incident
 from iort_agent.recorder.ring import Drop, RingChannel, RingMessage
-from iort_agent.sources.ros import matches
 
 INCIDENT, ACCOUNT = "iort.incident", "iort.account"
 PART = ".part"
@@ -109,11 +111,6 @@ class _Channels:
         return self._ids[key]
 
 
-def wanted(patterns: Sequence[str]) -> Callable[[str], bool]:
-    """Whether a topic or stream fits one of the patterns; all do if there are none."""
-    return lambda name: not patterns or any(matches(pattern, name) for pattern in patterns)
-
-
 def cut(
     ring: Source,
     incident: Incident,
@@ -132,7 +129,23 @@ def cut(
     descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         out = _Hashed(file, limit)
-        _write(ring, incident, out, account, compression, pause, has_room, losses)
+        # Optional, and asked for by the ring before.
+        mcap = importlib.import_module("mcap.writer")
+        kind = mcap.CompressionType
+        how = kind.NONE if compression == NONE else kind.ZSTD if compression == ZSTD else kind.LZ4
+        writer = mcap.Writer(out, compression=how)
+        has_room()
+        for i, _ in enumerate(_copied(ring, incident, writer, account)):
+            if not i % _BURST:
+                pause()
+            if not i % _ROOM_EVERY:
+                has_room()
+        drops = ring.drops(incident.ring_from_us, incident.ring_to_us)
+        topics = account.close(drops, losses, partial(fits, incident.topics or ["*"]))
+        account.late_us = max(0, ring.since_us() - incident.ring_from_us)
+        writer.add_metadata(INCIDENT, _about(incident, account))
+        writer.add_metadata(ACCOUNT, {topic: json.dumps(counts) for topic, counts in topics.items()})
+        writer.finish()
         file.flush()
         os.fsync(file.fileno())
         moment_ns = max(0, incident.edges[0].t_us) * 1000
@@ -140,30 +153,15 @@ def cut(
     return Cut(out.size, out.sha256.hexdigest(), account.messages, account.missing, account.late_us)
 
 
-def _write(
-    ring: Source,
-    incident: Incident,
-    out: _Hashed,
-    account: Account,
-    compression: str,
-    pause: Callable[[], object],
-    has_room: Callable[[], object],
-    losses: Counted,
-) -> None:
-    # Optional, and asked for by the ring before.
-    mcap = importlib.import_module("mcap.writer")
-    kind = mcap.CompressionType
-    how = kind.NONE if compression == NONE else kind.ZSTD if compression == ZSTD else kind.LZ4
-    writer = mcap.Writer(out, compression=how)
+def _copied(ring: Source, incident: Incident, writer: Any, account: Account) -> Iterator[None]:
+    """Copies the messages of the window, a step each."""
     channels = _Channels(writer)
     from_us, to_us = incident.ring_from_us, incident.ring_to_us
-    has_room()
-    began = False
-    for i, message in enumerate(ring.read(from_us - SLACK_US, to_us + SLACK_US, incident.topics or None)):
-        if not began:
-            # rosbags opens what says that it is ROS 2's.
-            writer.start(_PROFILES.get(message.channel.encoding, ""), _LIBRARY)
-            began = True
+    messages = ring.read(from_us - SLACK_US, to_us + SLACK_US, incident.topics or None)
+    first = next(messages, None)
+    # rosbags opens what says that it is ROS 2's.
+    writer.start(_PROFILES.get(first.channel.encoding, "") if first is not None else "", _LIBRARY)
+    for message in chain([first] if first is not None else [], messages):
         kept = from_us <= message.ring_us <= to_us or incident.from_us <= message.t_us <= incident.to_us
         account.take(message, kept=kept)
         if kept:
@@ -174,17 +172,7 @@ def _write(
                 message.t_us * 1000,
                 message.seq & 0xFFFFFFFF,
             )
-        if not i % _BURST:
-            pause()
-        if not i % _ROOM_EVERY:
-            has_room()
-    if not began:
-        writer.start("", _LIBRARY)
-    topics = account.close(ring.drops(from_us, to_us), losses, wanted(incident.topics))
-    account.late_us = max(0, ring.since_us() - from_us)
-    writer.add_metadata(INCIDENT, _about(incident, account))
-    writer.add_metadata(ACCOUNT, {topic: json.dumps(counts) for topic, counts in topics.items()})
-    writer.finish()
+        yield
 
 
 def _about(incident: Incident, account: Account) -> Mapping[str, str]:
@@ -210,5 +198,6 @@ def _about(incident: Incident, account: Account) -> Mapping[str, str]:
         "begins_late_s": f"{account.late_us / 1e6:.3f}",
         # Each run of the agent: from its first message in the window to its last.
         "runs": json.dumps(account.runs),
+        "pauses": json.dumps(account.pauses),
         "agent": json.dumps(incident.agent),
     }

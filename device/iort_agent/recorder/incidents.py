@@ -14,7 +14,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Callable, Mapping, Protocol, Tuple
+from typing import Any, Callable, Mapping, Protocol
 
 from iort_agent.common.threads import Clock
 from iort_agent.recorder import cut
@@ -25,7 +25,8 @@ from iort_contract.catalog.streams import INCIDENT_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages import recorder
 from iort_contract.messages.files import File, file_key
-from iort_contract.messages.recorder import KEPT, LOST, NOTIFIED, OVER_BUDGET, UPLOADED, Take, Trigger
+from iort_contract.messages.recorder import KEPT, LOST, NOTIFIED, OVER_BUDGET, STATES, UPLOADED, Take, Trigger
+from iort_contract.topics import ACCEPTED
 from iort_contract.triggers import Window, cools, merge
 
 _log = logging.getLogger(__name__)
@@ -85,11 +86,11 @@ class Incidents:
         self.wake = threading.Event()
         self.on_file: Callable[[], object] = lambda: None
         # Id -> the state that was told, and when.
-        self._told: dict[str, Tuple[str, float]] = {}
+        self._told: dict[str, tuple[str, float]] = {}
         # Id -> when it is tried again, and how often it failed.
-        self._held: dict[str, Tuple[float, int]] = {}
+        self._held: dict[str, tuple[float, int]] = {}
         self.alarm: str | None = None
-        self.counts = dict.fromkeys(("edges", "cooled", "merged", KEPT, UPLOADED, NOTIFIED, OVER_BUDGET, LOST), 0)
+        self.counts = dict.fromkeys(("edges", "cooled", "merged", *STATES), 0)
         for part in folder.glob(f"*{cut.PART}"):
             part.unlink(missing_ok=True)
 
@@ -133,9 +134,7 @@ class Incidents:
         with self._plan.lock:
             if take.id in self._plan.takes:
                 return
-            self._plan.takes[take.id] = "accepted"
-            while len(self._plan.takes) > _TAKES:
-                del self._plan.takes[next(iter(self._plan.takes))]
+            self._answer(take.id, ACCEPTED)
             self._add(
                 Incident(
                     id=incident_id(self._robot, take.id, 0),
@@ -147,6 +146,19 @@ class Incidents:
                     topics=list(take.topics),
                 )
             )
+
+    def refuse(self, take_id: str, why: str) -> None:
+        """Note a take that cannot be done."""
+        with self._plan.lock:
+            if take_id not in self._plan.takes:
+                self._answer(take_id, why)
+                self._plan.save()
+
+    def _answer(self, take_id: str, answer: str) -> None:
+        takes = self._plan.takes
+        takes[take_id] = answer
+        while len(takes) > _TAKES:
+            del takes[next(iter(takes))]
 
     def step(self, stop: threading.Event) -> bool:
         """Cut the next incident that is due; False if none is. Also ends what has been told for certain."""
@@ -193,13 +205,13 @@ class Incidents:
             incident = other
         else:
             incident.agent = dict(self._agent())
-            label = incident.triggers[0] if incident.triggers else "take"
-            incident.file = f"{label}-{incident.id}.mcap" if incident.state == OPEN else ""
+            first = incident.edges[0].trigger or "take"
+            incident.file = f"{first}-{incident.id}.mcap" if incident.state == OPEN else ""
             plan.incidents[incident.id] = incident
             if incident.state != OPEN:
                 self.counts[incident.state] += 1
         plan.save()
-        _log.info("recorder: %s: incident %s, %s", incident.texts("trigger", ",") or "take", incident.id, incident.state)
+        _log.info("recorder: %s: incident %s, %s", _names(incident), incident.id, incident.state)
         self._say(incident)
         self.wake.set()
 
@@ -249,7 +261,9 @@ class Incidents:
     def _cut(self, incident: Incident, stop: threading.Event) -> None:
         path = self.folder / incident.file
         with self._plan.lock:
-            # From here on no other window is merged into it.
+            if incident.ring_to_us + SETTLE_US > self._ring.now_us():
+                return  # another window was merged into it just now
+            # From here on none is.
             done = bool(incident.key) and path.exists()
             incident.key = incident.key or "cutting"
             left, free = self._left(incident), self._max_bytes - self._waiting_bytes()
@@ -277,9 +291,9 @@ class Incidents:
                 self._end(incident, LOST, "the ring has no message of it any more" + _late(made))
                 return
             self._note(incident, made)
-            part = path.with_name(path.name + cut.PART)
-            os.replace(part, path)
-            _sync(self.folder)
+            path.with_name(path.name + cut.PART).replace(path)
+            with suppress(OSError):
+                _sync(self.folder)
         with self._plan.lock:
             payer = self._payer(incident)
             if payer:
@@ -358,16 +372,17 @@ class Incidents:
     def _say(self, incident: Incident) -> None:
         """Tell an incident's state as a sample."""
         state = KEPT if incident.state == OPEN else incident.state
+        said = _values(incident), incident.texts("why", "; "), incident.why
         sample = recorder.Incident(
             id=incident.id,
-            trigger=",".join(incident.triggers),
+            trigger=_names(incident),
             from_us=incident.from_us,
             to_us=incident.to_us,
             state=state,
-            condition=incident.texts("when", " | ")[:_MAX_TEXT],
-            why="; ".join(filter(None, (incident.texts("why", "; "), incident.why)))[:_MAX_TEXT],
+            condition=incident.edges[0].when[:_MAX_TEXT],
+            why="; ".join(filter(None, said))[:_MAX_TEXT],
             by=incident.texts("by", ", ")[:_MAX_TEXT],
-            key=incident.key if incident.state in (KEPT, UPLOADED) else "",
+            key=incident.key if incident.state == UPLOADED else "",
             bytes=incident.size,
             messages=incident.messages,
             missing=incident.missing,
@@ -397,12 +412,23 @@ def _telling(incident: Incident) -> str:
     return f"{incident.state} {incident.from_us} {incident.to_us} {len(incident.edges)}"
 
 
+def _names(incident: Incident) -> str:
+    """What fired it."""
+    return ",".join(dict.fromkeys(edge.trigger or "take" for edge in incident.edges))
+
+
+def _values(incident: Incident) -> str:
+    """The values at the first edge."""
+    return ", ".join(f"{name}={value}" for name, value in incident.edges[0].values.items())
+
+
 def _window(incident: Incident) -> Window:
     return Window(incident.ring_from_us, incident.ring_to_us, ())
 
 
 def _late(made: cut.Cut) -> str:
-    return f": the ring begins {made.late_us / 1e6:.1f} s after the window" if made.late_us > 1_000_000 else ""
+    late_s = made.late_us / 1e6
+    return f": the ring begins {late_s:.1f} s after the window" if late_s > 1 else ""
 
 
 def _remove(path: Path) -> None:

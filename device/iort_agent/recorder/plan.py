@@ -155,7 +155,7 @@ class Plan:
         except FileNotFoundError:
             return
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            _log.error("recorder: %s cannot be read: pending incidents are lost: %s", self.folder / FILE, error)
-            self.alarm = f"recorder: {self.folder / FILE} could not be read: pending incidents are lost"
+            self.alarm = f"recorder: {self.folder / FILE} cannot be read: pending incidents are lost: {error}"
+            _log.error("%s", self.alarm)
             return
         self.incidents = {incident.id: incident for incident in incidents}

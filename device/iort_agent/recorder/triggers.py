@@ -171,26 +171,25 @@ class Triggers:
         self._bytes = 0
         self._armed: dict[str, _Armed] = {}
         self._refused: dict[str, str] = {}
-            self._streams: frozenset[str] = frozenset()
+        # The streams that are evaluated.
+        self._streams: frozenset[str] = frozenset()
         # Samples that came faster than they could be evaluated.
         self.unseen = 0
         self._arm()
 
     def around(self, emit: Emit) -> Emit:
         """An `Emit` that takes note of each sample that a trigger needs."""
-        inbox = self._inbox
+        return _Noted(self, emit)
 
-        def emit_noted(stream: str, t_us: int, values: Mapping[str, Value], *, more: bool = False) -> float:
-            if stream in self._streams:
-                size = len(values.raw) if isinstance(values, RosMessage) else 0
-                if len(inbox) >= _MAX_INBOX or self._bytes > _MAX_INBOX_BYTES:
-                    self.unseen += 1
-                else:
-                    self._bytes += size
-                    inbox.append(_Heard(stream, t_us, self._now_us(), values))
-            return emit(stream, t_us, values, more=more)
-
-        return emit_noted
+    def note(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
+        """Put a sample into the inbox if a trigger needs it."""
+        if stream in self._streams:
+            if len(self._inbox) >= _MAX_INBOX or self._bytes > _MAX_INBOX_BYTES:
+                self.unseen += 1
+                return
+            # Not exact, since several threads count; `step` begins anew.
+            self._bytes += len(values.raw) if isinstance(values, RosMessage) else 0
+            self._inbox.append(_Heard(stream, t_us, self._now_us(), values))
 
     def desire(self, triggers: Mapping[str, Any]) -> None:
         """Put these in force instead of the others, also after a restart."""
@@ -229,6 +228,10 @@ class Triggers:
             self._on_edge(trigger, Edge(trigger.name, edge.t_us, on, edge.values, edge.why, edge.by), ring_us)
         return len(fired)
 
+    def names(self, on: str) -> list[str]:
+        """The triggers of an event."""
+        return [name for name, armed in [*self._armed.items()] if armed.trigger.on == on]
+
     def answers(self) -> dict[str, str]:
         """By name: `ACCEPTED`, or why not."""
         now_us = self._now_us()
@@ -258,9 +261,22 @@ class Triggers:
                 if one.evaluator is not None and (own := one.evaluator.streams & OWN_STREAMS):
                     raise ContractError(f"{min(own)} is the agent's own stream, which fires no trigger")  # noqa: TRY301 - as above
                 armed[name] = one
-            except (ContractError, ExpressionError) as error:
+            except (ContractError, ExpressionError) as error:  # noqa: PERF203 - each has its own answer
                 refused[name] = str(error).partition("\n")[0]
                 _log.warning("recorder: trigger %s is refused: %s", name, error)
         self._armed, self._refused = armed, refused
         needed = [one.evaluator.streams for one in armed.values() if one.evaluator is not None]
         self._streams = frozenset().union(*needed) - {TYPES_STREAM}
+
+
+class _Noted:
+    """The `Emit` that `Triggers.around` makes."""
+
+    def __init__(self, triggers: Triggers, emit: Emit) -> None:
+        self._note, self._emit = triggers.note, emit
+        # What a source gives depends on this: see `iort_agent.recorder.ring`.
+        self.keeps_whole = getattr(emit, "keeps_whole", False)
+
+    def __call__(self, stream: str, t_us: int, values: Mapping[str, Value], *, more: bool = False) -> float:
+        self._note(stream, t_us, values)
+        return self._emit(stream, t_us, values, more=more)
