@@ -37,6 +37,7 @@ from iort_agent.lanes import PingConfig
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.client import Broker
 from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.recorder.config import RecorderConfig
 from iort_agent.ros import ros2_node as ros2_module
 from iort_agent.ros.ros1_node import Node
 from iort_agent.runtime import Runtime
@@ -111,6 +112,7 @@ def in_the_whole_agent(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> N
         downlink=load(DownlinkConfig, DOWNLINK, Place(folder / "car.yaml")),
         ping=PingConfig(rate_hz=20, paths=("broker",)),
         files=FilesConfig(folder=files),
+        recorder=RecorderConfig(folder=folder / "ring", keep_free_mb=0),
     )
     uplink = Loopback(clock, Dispatcher())
     spool = SqliteSpool(folder / "queue.db", max_bytes=10**9, clock=clock)
@@ -242,7 +244,10 @@ def uplink(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> None:
 Scenario = Callable[[str, Path, pytest.MonkeyPatch], None]
 SCENARIOS: dict[str, Scenario] = {
     **dict.fromkeys(
-        ["callbacks", "downlink", "pings", "record", "source", "spool", "ticker", "uploads"],
+        [
+            *("callbacks", "downlink", "incidents", "pings", "record", "recorder", "ring"),
+            *("source", "spool", "ticker", "uploads"),
+        ],
         in_the_whole_agent,
     ),
     "asks": asks,
