@@ -188,7 +188,7 @@ class Runtime:
             emit = self.agent.attachments.around(emit)
         if self.agent.recorder is not None:
             # First, so that the ring has the messages as they were published.
-            emit = self.agent.recorder.around(emit)
+            emit = self.agent.recorder.around(emit, source.only_ring)
         return Supervised("source", lambda: self._run_source(source, emit), title=str(i))
 
     def _run_source(self, source: SourceRun, emit: Emit) -> None:

@@ -99,7 +99,7 @@ class Ring:
         self._flushes: list[threading.Event] = []
 
         self._kick, self._ending = threading.Event(), threading.Event()
-        self._thread = Supervised("ring", self._work_until_end, clock=clock)
+        self._thread = Supervised("ring", self._work_until_end)
 
     @property
     def alarm(self) -> str | None:

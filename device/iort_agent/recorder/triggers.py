@@ -179,7 +179,13 @@ class Triggers:
 
     def around(self, emit: Emit) -> Emit:
         """An `Emit` that takes note of each sample that a trigger needs."""
-        return _Noted(self, emit)
+        note = self.note
+
+        def emit_noted(stream: str, t_us: int, values: Mapping[str, Value], *, more: bool = False) -> float:
+            note(stream, t_us, values)
+            return emit(stream, t_us, values, more=more)
+
+        return emit_noted
 
     def note(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
         """Put a sample into the inbox if a trigger needs it."""
@@ -267,16 +273,3 @@ class Triggers:
         self._armed, self._refused = armed, refused
         needed = [one.evaluator.streams for one in armed.values() if one.evaluator is not None]
         self._streams = frozenset().union(*needed) - {TYPES_STREAM}
-
-
-class _Noted:
-    """The `Emit` that `Triggers.around` makes."""
-
-    def __init__(self, triggers: Triggers, emit: Emit) -> None:
-        self._note, self._emit = triggers.note, emit
-        # What a source gives depends on this: see `iort_agent.recorder.ring`.
-        self.keeps_whole = getattr(emit, "keeps_whole", False)
-
-    def __call__(self, stream: str, t_us: int, values: Mapping[str, Value], *, more: bool = False) -> float:
-        self._note(stream, t_us, values)
-        return self._emit(stream, t_us, values, more=more)
