@@ -24,6 +24,8 @@ _log = logging.getLogger(__name__)
 
 # A segment is closed after these bytes or this time, and then it may be deleted.
 SEGMENT_BYTES, SEGMENT_S = 8 * 1024 * 1024, 10.0
+# The last chunk may make it a little larger.
+_ROOM_BYTES = SEGMENT_BYTES + 2 * 1024 * 1024
 # Why the oldest segment was deleted.
 SIZE, AGE, SHARE, FULL = "max_mb", "max_age_s", "max_disk_share", "disk full"
 _NAME = re.compile(r"(\d{8,})-(\d+)\.mcap")
@@ -85,7 +87,8 @@ class RingFolder:
             return tuple(self._segments)
 
     def begin(self, from_us: int) -> SegmentFile:
-        """Begin a segment. Raises `OSError`."""
+        """Begin a segment, with room for a whole one. Raises `OSError`."""
+        self._fit()
         path = self.path / f"{self._next:08d}-{from_us}.mcap"
         self._next += 1
         self._synced = False
@@ -113,16 +116,9 @@ class RingFolder:
 
     def evict(self, now_us: int) -> int:
         """Delete what the bounds do not allow; the bytes of the disk that others lack even so, 0 if none.
-        There is room for a whole segment afterwards, unless others lack bytes. Raises `OSError`."""
-        config = self._config
-        disk = os.statvfs(self.path)
-        allowed, why = round(config.max_mb * 1e6), SIZE
-        share = round(config.max_disk_share * disk.f_blocks * disk.f_frsize)
-        if share < allowed:
-            allowed, why = share, SHARE
-        while self._bytes() > max(0, allowed - SEGMENT_BYTES):
-            self._evict_one(why)
-        since_us = now_us - round(config.max_age_s * 1e6)
+        Raises `OSError`."""
+        self._fit()
+        since_us = now_us - round(self._config.max_age_s * 1e6)
         while self._segments and self._segments[0].to_us < since_us:
             self._evict_one(AGE)
         while True:
@@ -130,6 +126,15 @@ class RingFolder:
             lacking = self._reserve - disk.f_bavail * disk.f_frsize
             if lacking <= 0 or not self._evict_one(FULL):
                 return max(0, lacking)
+
+    def _fit(self) -> None:
+        config, disk = self._config, os.statvfs(self.path)
+        allowed, why = round(config.max_mb * 1e6), SIZE
+        share = round(config.max_disk_share * disk.f_blocks * disk.f_frsize)
+        if share < allowed:
+            allowed, why = share, SHARE
+        while self._bytes() > max(0, allowed - _ROOM_BYTES):
+            self._evict_one(why)
 
     def make_room(self) -> bool:
         """Delete the oldest segment, for a disk that is full; whether there was one."""
