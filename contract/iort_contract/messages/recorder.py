@@ -6,6 +6,7 @@ A trigger's condition is read by `iort_contract.triggers`, whose `check_trigger`
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import re
@@ -34,6 +35,8 @@ RECORDER, TRIGGERS, TAKES = "recorder", "triggers", "takes"
 # States of an incident.
 KEPT, UPLOADED, NOTIFIED, OVER_BUDGET, LOST = "kept", "uploaded", "notified", "over_budget", "lost"
 STATES = (KEPT, UPLOADED, NOTIFIED, OVER_BUDGET, LOST)
+# Among an incident's triggers, that an operator took it.
+TAKE = "take"
 
 _TOPIC = re.compile(r"[A-Za-z0-9_/*~.-]{1,128}")
 _US = 1_000_000
@@ -132,6 +135,12 @@ def incident(sample: Mapping[str, Value]) -> Incident:
     if found.state not in STATES:
         raise ContractError(f"state must be one of {', '.join(STATES)}, got {shown(found.state)}")
     return found
+
+
+def incident_id(robot: str, what: str, t_us: int) -> str:
+    """The id of the incident that begins with an edge of a trigger, or with the take ``what`` and the time 0:
+    the same one after a restart."""
+    return hashlib.sha256(f"{robot}\0{what}\0{t_us}".encode()).hexdigest()[:16]
 
 
 def check_limits(trigger: Trigger) -> Trigger:

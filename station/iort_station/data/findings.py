@@ -16,7 +16,7 @@ from iort_contract.limits import ContractError
 from iort_contract.messages.analysis import AnalysedDrive, Estimate, Finding, Note, check_note_id
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import registry
+from iort_station.fleet import recorder, registry
 
 _T = TypeVar("_T", Finding, AnalysedDrive, Note)
 
@@ -79,18 +79,24 @@ def _key(row: Finding | AnalysedDrive | Note) -> str:
     return str(row.drive) if isinstance(row, AnalysedDrive) else row.id
 
 
-def write_note(cloud: Cloud, robot: str, text: str, *, by: str, t_us: int | None = None) -> Note:
-    """Write a note about a registered robot at a time; the default is now.
+def write_note(
+    cloud: Cloud, robot: str, text: str, *, by: str, t_us: int | None = None, keep_us: int = 0
+) -> Note:
+    """Write a note about a registered robot at a time; the default is now. The robot's recorder keeps what is
+    ``keep_us`` before that time; nothing for 0.
 
-    Raises `UsageError` for a text that is empty or too long.
+    Raises `UsageError` for a text that is empty or too long, and for a time that no recorder keeps.
     """
     registry.get(cloud, robot)
     at_us = time.time_ns() // 1000 if t_us is None else t_us
     note = Note(robot, at_us, text.strip(), by, secrets.token_hex(4))
     try:
+        taken = recorder.new_take(at_us - keep_us, at_us, by=by, why=note.text) if keep_us else None
         findings_table(cloud).put_note(note)
     except ContractError as error:
         raise UsageError(f"{error}; nothing is written") from error
+    if taken is not None:
+        recorder.send_take(cloud, robot, taken)
     return note
 
 

@@ -1,20 +1,116 @@
 """A robot's event recorder, by its shadow: the triggers that it is to have, what an operator takes, and the
-robot's answers."""
+robot's answers.
+
+Whether a trigger can fire on a robot is for `iort_station.data.triggers` to see before it is added.
+"""
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NamedTuple
 
 from iort_contract.limits import ContractError
-from iort_contract.messages.recorder import Take, encode_take
+from iort_contract.messages import recorder as messages
+from iort_contract.messages.recorder import MAX_TRIGGERS, MAX_WHY, Take, Trigger
+from iort_contract.tables import ONLINE
+from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
-from iort_station.errors import StationError, UsageError
+from iort_station.errors import StationError, UsageError, unknown
+from iort_station.fleet import registry
 from iort_station.fleet.control import Shadow, State
 
 # Others may change the shadow at the same time; each time one of them has done.
 _TRIES = 20
+# A robot that the registry does not yet know to be connected may still answer.
+_OFFLINE_S = 2.0
+# After this, an answer that is as it was before is one to the change.
+_SAME_S = 4.0
+
+
+class RobotTrigger(NamedTuple):
+    """A trigger that a robot is to have, and its ``answer``: `ACCEPTED`, why not, or nothing yet. ``trigger``
+    is None if this station cannot read it; ``problem`` says why."""
+
+    robot: str
+    name: str
+    trigger: Trigger | None
+    answer: str = ""
+    problem: str = ""
+
+
+class Answer(NamedTuple):
+    """A robot's answer to a change: `ACCEPTED`, why not, or nothing yet; and whether it is connected."""
+
+    text: str
+    online: bool
+
+
+def triggers(cloud: Cloud, robot: str) -> list[RobotTrigger]:
+    """The triggers that a robot is to have, by name, beside its answers."""
+    state = Shadow(cloud, robot).read()
+    answers, listed = state.reported.recorder, list[RobotTrigger]()
+    for name, content in sorted(state.desired.recorder.triggers.items()):
+        trigger, problem = None, ""
+        try:
+            trigger = messages.decode_trigger(name, content)
+        except ContractError as error:
+            problem = str(error)
+        listed.append(RobotTrigger(robot, name, trigger, answers.get(name, ""), problem))
+    return listed
+
+
+def add(cloud: Cloud, robot: str, trigger: Trigger, seconds: float, *, withdraw: bool = True) -> Answer:
+    """Add a trigger, or replace that of its name, and wait for the robot's answer.
+
+    One that it refuses is taken back with ``withdraw``: what was there before stays. Raises `UsageError` for
+    a trigger that no agent accepts, and for one too many.
+    """
+    shadow, old = Shadow(cloud, robot), State()
+
+    def change(state: State) -> Mapping[str, Any]:
+        nonlocal old
+        old = state
+        there = state.desired.recorder.triggers
+        if trigger.name not in there and len(there) >= MAX_TRIGGERS:
+            raise UsageError(
+                f"{robot} has {len(there)} triggers, the most allowed: {', '.join(sorted(there))}. "
+                "`iort recorder remove` removes one"
+            )
+        return messages.encode_trigger(trigger)
+
+    _change(shadow, change)
+    answer = _answer(shadow, cloud, trigger.name, seconds, old.reported.recorder.get(trigger.name, ""))
+    if withdraw and answer.text not in {"", ACCEPTED}:
+        _change(shadow, lambda _: _restored(old, trigger.name))
+    return answer
+
+
+def remove(cloud: Cloud, robot: str, name: str) -> None:
+    """Remove a trigger; raises `StationError` if the robot is not to have one of this name."""
+    shadow = Shadow(cloud, robot)
+
+    def change(state: State) -> Mapping[str, Any]:
+        there = state.desired.recorder.triggers
+        if name not in there:
+            raise unknown(f"{robot} has no trigger {name}", [name], there, f"iort recorder list {robot}")
+        return {messages.RECORDER: {messages.TRIGGERS: {name: None}}}
+
+    _change(shadow, change)
+
+
+def new_take(from_us: int, to_us: int, *, by: str, why: str = "", topics: Collection[str] = ()) -> Take:
+    """A new take; raises `ContractError` for one that no agent accepts. Texts are cut to what it may have."""
+    return messages.check_take(
+        Take(secrets.token_hex(8), from_us, to_us, by[:MAX_WHY], why[:MAX_WHY], tuple(topics))
+    )
+
+
+def send_take(cloud: Cloud, robot: str, taken: Take) -> None:
+    """Have a robot keep what its ring has of a take, without waiting for it: one that is not connected does
+    so when it is back, as far as its ring reaches. The oldest takes in the shadow give way."""
+    _change(Shadow(cloud, robot), lambda state: messages.encode_take(taken, state.desired.recorder.takes))
 
 
 def take(
@@ -25,16 +121,44 @@ def take(
     *,
     by: str,
     why: str = "",
-    topics: tuple[str, ...] = (),
+    topics: Collection[str] = (),
 ) -> Take:
-    """Have a robot keep what its ring has between two times of its clock, without waiting for it: one that
-    is not connected does so when it is back, as far as its ring reaches.
+    """As `send_take`, with a new take between two times of the robot's clock.
 
-    The oldest takes in the shadow give way. Raises `UsageError` for a range that no agent accepts.
+    Raises `UsageError` for a range that no agent accepts.
     """
-    taken = Take(secrets.token_hex(8), from_us, to_us, by, why, topics)
-    _change(Shadow(cloud, robot), lambda state: encode_take(taken, state.desired.recorder.takes))
+    try:
+        taken = new_take(from_us, to_us, by=by, why=why, topics=topics)
+    except ContractError as error:
+        raise UsageError(f"{error}; nothing is taken") from error
+    send_take(cloud, robot, taken)
     return taken
+
+
+def take_answer(cloud: Cloud, robot: str, taken: Take, seconds: float) -> Answer:
+    """Wait for the robot's answer to a take."""
+    return _answer(Shadow(cloud, robot), cloud, taken.id, seconds)
+
+
+def _answer(shadow: Shadow, cloud: Cloud, name: str, seconds: float, old: str = "") -> Answer:
+    online = bool(registry.get(cloud, shadow.robot).get(ONLINE))
+    same_from = time.monotonic() + _SAME_S
+
+    def answered(state: State) -> str | None:
+        text = state.reported.recorder.get(name, "")
+        return text if text and (text != old or time.monotonic() >= same_from) else None
+
+    found = shadow.wait(answered, seconds if online else min(seconds, _OFFLINE_S))
+    return Answer(found or "", online)
+
+
+def _restored(before: State, name: str) -> Mapping[str, Any]:
+    """The change that brings back what was there before."""
+    content = before.desired.recorder.triggers.get(name)
+    try:
+        return messages.encode_trigger(messages.decode_trigger(name, content))
+    except ContractError:
+        return messages.encode_removal(name)
 
 
 def _change(shadow: Shadow, change: Callable[[State], Mapping[str, Any]]) -> None:

@@ -38,7 +38,7 @@ from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.operations import analysis
 from iort_station.operations.alarms import user
-from iort_station.times import between, iso_s, stamped, time_us
+from iort_station.times import between, duration_us, iso_s, stamped, time_us
 
 commands = typer.Typer()
 # The range without an option.
@@ -276,26 +276,34 @@ def note(
     ] = None,
     at: Annotated[str | None, option("The time that it is about. Default: now.", metavar="TIME")] = None,
     by: Annotated[str | None, option("Who writes it. Default: you.")] = None,
+    keep: Annotated[
+        str | None, option("Have the robot's recorder keep so long before it.", metavar="60s")
+    ] = None,
     remove: Annotated[str | None, option("Delete the note of this id.", metavar="ID")] = None,
     count: Annotated[int, option("The most to list; the newest.", min=1, max=10_000)] = 50,
     as_json: AsJson = False,
 ) -> None:
     """Write a note about a robot, or list its notes, the newest first.
 
-    The page marks them in the robot's history, and lists them in Insights.
+    The page marks them in the robot's history, and lists them in Insights. With --keep, the messages before
+    the note's time are kept too: `iort incidents` lists them.
     """
     cloud, within = context.obj.cloud(), when.range()
     if text is not None and remove is not None:
         raise UsageError("give a text to write, or --remove")
-    if text is None and (at is not None or by is not None):
-        raise UsageError("--at and --by need a text to write")
+    if text is None and (at is not None or by is not None or keep is not None):
+        raise UsageError("--at, --by and --keep need a text to write")
     if remove is not None:
         stored.remove_note(cloud, robot, remove)
         say(f"note {remove} of {robot} is deleted")
         return
     if text is not None:
         t_us = None if at is None else time_us(at, time.time_ns() // 1000)
-        found = [stored.write_note(cloud, robot, text, by=user() if by is None else by, t_us=t_us)]
+        keep_us = 0 if keep is None else duration_us(keep)
+        author = user() if by is None else by
+        found = [stored.write_note(cloud, robot, text, by=author, t_us=t_us, keep_us=keep_us)]
+        if keep is not None:
+            say(f"{robot} is to keep {keep} before it: `iort incidents {robot}` tells")
     else:
         registry.get(cloud, robot)
         found = stored.notes(cloud, robot, within.start_us, within.end_us, most=count)
