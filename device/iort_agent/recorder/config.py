@@ -24,15 +24,15 @@ class RecorderConfig:
     """
 
     folder: Path | None = setting(path(), None)
-    max_mb: float = setting(number(16, 2**20, unit="MB"), 1024.0)
-    max_age_s: float = setting(number(10, 30 * 86400, unit="s"), 3600.0)
+    max_mb: float = setting(number(16, 1_000_000, unit="MB"), 1000.0)
+    max_age_s: float = setting(number(10, 604_800, unit="s"), 3600.0)
     max_disk_share: float = setting(number(0.001, 0.9), 0.2)
-    keep_free_mb: float = setting(number(0, 2**20, unit="MB"), 256.0)
+    keep_free_mb: float = setting(number(0, 1_000_000, unit="MB"), 256.0)
     topics: tuple[str, ...] = setting(
         items(text(), at_least=1, what="a list of at least one topic or stream"), ("*",)
     )
     compression: str = setting(choice(LZ4, ZSTD, NONE), LZ4)
-    memory_mb: float = setting(number(1, 1024, unit="MB"), 32.0)
+    memory_mb: float = setting(number(1, 1000, unit="MB"), 32.0)
     sync_s: float = setting(number(1, 60, unit="s"), 5.0)
     service: str | None = setting(text(ros_name), None)
     topic: str | None = setting(text(ros_name), None)

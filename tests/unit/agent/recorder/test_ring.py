@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any, Iterator
 
 import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader, make_reader
 
 from iort_agent.errors import AgentError
 from iort_agent.recorder.config import RecorderConfig
@@ -23,11 +25,6 @@ from iort_agent.sources.intake import Selected
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.ros.message import MessageType, RosMessage, RosType
 from testkit.agent import ManualClock
-
-pytest.importorskip("mcap")
-
-from mcap.exceptions import EndOfFile
-from mcap.reader import NonSeekingReader, make_reader
 
 S = 1_000_000
 T0 = 1_700_000_000_000_000
