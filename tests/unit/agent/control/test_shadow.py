@@ -15,6 +15,7 @@ from iort_agent.control.shadow import Shadow, _difference, _merged, overlay
 from iort_agent.lanes import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_contract.messages.commands import Command
+from iort_contract.messages.recorder import Wanted
 from iort_contract.messages.shadow import OverShare, Reported, decode_desired, encode_reported
 from testkit.agent import Loopback, ManualClock, link_of
 
@@ -28,7 +29,7 @@ DOCUMENT = encode_reported(Reported(BASE.by_name(), agent_version="1.2.3", moves
 class Rig:
     """A robot and its shadow, which behaves as AWS'."""
 
-    def __init__(self, version: str = "1.2.3", **desired: Any) -> None:
+    def __init__(self, version: str = "1.2.3", recorder: Any = None, **desired: Any) -> None:
         self.clock, self.dispatcher = ManualClock(), Dispatcher()
         self.uplink = Loopback(self.clock, self.dispatcher)
         self.applied: list[RuntimeSettings] = []
@@ -41,6 +42,7 @@ class Rig:
             known_fields=lambda: {"vesc": {"speed", "voltage_input"}},
             version=version,
             moves=True,
+            recorder=recorder,
         )
         self.seen = 0
         self.uplink.connect()
@@ -402,3 +404,40 @@ def test_unknown_names_do_not_fill_the_shadow() -> None:
         rig.shadow.answer(f"name{i}", Command("feedbeef", 1, i, 2, 500, {}), "no such command")
     rig.settle()
     assert list(rig.reported["commands"]) == [f"name{i}" for i in range(24, 40)]
+
+
+class Keeper:
+    """A recorder that answers when it likes."""
+
+    def __init__(self) -> None:
+        self.answers: dict[str, str] = {}
+        self.wanted: list[Wanted] = []
+
+    def want(self, wanted: Wanted) -> None:
+        self.wanted.append(wanted)
+
+
+TRIGGERS = {"triggers": {"hardbrake": {"when": "current_input < -15"}}}
+
+
+def test_the_recorder_is_told_what_is_wanted_and_its_answers_are_reported() -> None:
+    keeper = Keeper()
+    rig = Rig(recorder=keeper)
+    rig.desire(recorder=TRIGGERS)
+    assert keeper.wanted[-1].triggers == TRIGGERS["triggers"]
+    assert not rig.reported.get("recorder")
+    keeper.answers = {"hardbrake": "accepted"}
+    rig.shadow.tell()
+    rig.settle()
+    assert rig.reported["recorder"] == {"hardbrake": "accepted"}
+    rig.desire(recorder=None)
+    assert keeper.wanted[-1] == Wanted()
+    assert not rig.reported.get("rejected")
+
+
+def test_a_robot_without_a_recorder_says_so() -> None:
+    rig = Rig()
+    rig.desire(recorder=TRIGGERS)
+    assert rig.reported["recorder"] == {
+        "hardbrake": "the robot has no recorder: car.yaml has no section recorder"
+    }

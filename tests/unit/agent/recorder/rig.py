@@ -10,8 +10,9 @@ from typing import Any, Callable, Iterable, Iterator, Mapping, Sequence
 
 from iort_agent.recorder.account import Losses
 from iort_agent.recorder.config import RecorderConfig
+from iort_agent.recorder.folder import Drop
 from iort_agent.recorder.incidents import Incidents
-from iort_agent.recorder.ledger import Drop, fits
+from iort_agent.recorder.ledger import fits
 from iort_agent.recorder.plan import Plan
 from iort_agent.recorder.segment import RingChannel, RingMessage
 from iort_agent.recorder.triggers import Triggers
@@ -124,7 +125,7 @@ class Rig:
     def pass_s(self, seconds: float, *, hz: float = 10.0, **values: Value) -> None:
         """Let time pass with samples of this rate, and evaluate them."""
         for _ in range(round(seconds * hz)):
-            self.emit(**{"current_input": 0.0, **values})
+            self._emit("vesc", self.clock.now_us(), {"current_input": 0.0, **values})
             self.clock.advance(1 / hz)
         self.watch.step()
 

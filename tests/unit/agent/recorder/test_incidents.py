@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any, Callable
 
 import pytest
 from mcap.reader import make_reader
 
-from iort_agent.recorder import cut, incidents, plan
-from iort_agent.recorder.ledger import Drop
+from iort_agent.common.private_files import write_below
+from iort_agent.recorder import incidents, plan
+from iort_agent.recorder.folder import Drop
 from iort_contract.messages.recorder import KEPT, LOST, NOTIFIED, OVER_BUDGET, UPLOADED
 from tests.unit.agent.recorder.rig import BRAKE, T0, FakeRing, Rig, S
 
@@ -153,9 +155,9 @@ def kill_at(patch: pytest.MonkeyPatch, rig: Rig, n: int) -> None:
 
         return wrapped
 
-    patch.setattr(plan, "write_below", wrap(plan.write_below))
+    patch.setattr(plan, "write_below", wrap(write_below))
     patch.setattr(Path, "replace", wrap(Path.replace))
-    patch.setattr(cut.os, "fsync", wrap(cut.os.fsync))
+    patch.setattr(os, "fsync", wrap(os.fsync))
     patch.setattr(incidents, "_sync", wrap(incidents._sync))
     rig.on_tell = wrap(lambda: None)
     rig.incidents.uploaded = wrap(rig.incidents.uploaded)  # type: ignore[method-assign]  # a kill in it
@@ -280,7 +282,7 @@ def test_a_full_disk_keeps_the_incident_until_there_is_room(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(cut.os, "fsync", full)
+        patch.setattr(os, "fsync", full)
         rig.cut()
         assert list(rig.files.iterdir()) == []
         assert "No space left on device; it is tried again" in str(rig.incidents.alarm)
@@ -302,7 +304,7 @@ def test_a_full_disk_until_the_ring_has_nothing_more_loses_it_aloud(
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(cut.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     rig.cut()
     assert rig.states() == [KEPT, LOST]
     assert "is lost" in caplog.text

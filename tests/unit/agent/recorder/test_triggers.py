@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +111,7 @@ def test_one_that_costs_too_much_is_refused_and_the_others_go_on(
         return sample(self, *args)
 
     monkeypatch.setattr(Evaluator, "sample", slow)
-    monkeypatch.setattr(module.time, "thread_time_ns", lambda: busy_ns)
+    monkeypatch.setattr(time, "thread_time_ns", lambda: busy_ns)
     rig = Rig(tmp_path, triggers={"dear": {"when": "duty > 1"}, "good": BRAKE})
     for _ in range(12):
         rig.pass_s(1, duty=0.0)
@@ -135,7 +136,7 @@ def test_one_that_stalls_is_refused_in_the_middle(tmp_path: Path, monkeypatch: p
         return ()
 
     monkeypatch.setattr(Evaluator, "sample", stall)
-    monkeypatch.setattr(module.time, "thread_time_ns", lambda: busy_ns)
+    monkeypatch.setattr(time, "thread_time_ns", lambda: busy_ns)
     rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
     rig.pass_s(100, hz=10)
     assert busy_ns < 10_000_000_000

@@ -1,0 +1,233 @@
+"""The recorder as the agent runs it: a real ring, the shadow's words, events, and files that others open."""
+
+from __future__ import annotations
+
+import json
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Callable, Iterator, Mapping
+
+import pytest
+
+from iort_agent.agent import Agent, make_status
+from iort_agent.common.state import Connection
+from iort_agent.common.threads import SystemClock
+from iort_agent.config import Config
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.recorder.config import RecorderConfig
+from iort_agent.recorder.recorder import DISCONNECT_S, Recorder
+from iort_agent.runtime import Runtime
+from iort_agent.sources import Emit
+from iort_agent.status import render
+from iort_contract.messages.recorder import (
+    KEPT,
+    UPLOADED,
+    Incident,
+    Take,
+    Trigger,
+    Wanted,
+    encode_take,
+    encode_trigger,
+    incident,
+)
+from iort_contract.ros.message import RosMessage, RosType
+from iort_contract.topics import ACCEPTED
+from testkit.agent import Loopback, ManualClock, MemorySpool
+from testkit.waiting import until
+from tests.unit.agent.control.downlink_rig import FakeGraph
+from tests.unit.agent.control.test_peers import string
+from tests.unit.agent.recorder.rig import BRAKE, T0, S
+from tests.unit.agent.test_agent import Script
+
+highlevel = pytest.importorskip("rosbags.highlevel")
+reader = pytest.importorskip("mcap.reader")
+
+TEXT = RosType("/chatter", "std_msgs/msg/String", "RIHS01_1", "string data")
+
+
+def cdr(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + len(data).to_bytes(4, "little") + data
+
+
+class Bench:
+    """A recorder whose threads are this one."""
+
+    def __init__(self, folder: Path, graph: FakeGraph | None = None, **settings: Any) -> None:
+        self.clock = ManualClock(now_us=T0)
+        self.told: list[Incident] = []
+        self.connection = Connection(True, 100.0, 1)
+        self.graph = graph
+        config = RecorderConfig(folder=folder, keep_free_mb=0, **settings)
+        self.recorder = Recorder(
+            config,
+            self.clock,
+            robot="car1",
+            run="0123456789abcdef",
+            reserve=0,
+            tell=lambda _stream, _t_us, values: self.told.append(incident(values)),
+            connection=lambda: self.connection,
+            graph=graph,
+        )
+        self.answers: list[Mapping[str, str]] = []
+        self.recorder.on_answers = lambda: self.answers.append(self.recorder.answers)
+
+    def want(self, *triggers: Trigger, takes: tuple[Take, ...] = ()) -> None:
+        wanted: dict[str, Any] = {"triggers": {}, "takes": {}}
+        for trigger in triggers:
+            wanted["triggers"].update(encode_trigger(trigger)["recorder"]["triggers"])
+        for take in takes:
+            wanted["takes"].update(encode_take(take, {})["recorder"]["takes"])
+        # As the shadow has it: null removes.
+        for entries in wanted.values():
+            for name, entry in entries.items():
+                entries[name] = {key: value for key, value in entry.items() if value is not None}
+        self.recorder.want(Wanted(**wanted))
+        self.step()
+
+    def step(self) -> None:
+        self.recorder.step()
+        self.recorder.step_slowly()
+
+
+def test_the_shadow_is_followed_and_answered(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "ring")
+    take = Take("a" * 16, T0 - 10 * S, T0, "anna")
+    bench.want(Trigger("good", "speed > 1"), Trigger("bad", "speed_mps > 1"), takes=(take,))
+    answers = bench.answers[-1]
+    assert answers["good"] == answers["a" * 16] == ACCEPTED
+    assert "speed_mps needs the vehicle's parameters" in answers["bad"]
+    assert [one.trigger for one in bench.told] == ["take"]
+    assert any("bad" in alarm for alarm in bench.recorder.alarms())
+    count = len(bench.answers)
+    bench.want(Trigger("good", "speed > 1"), Trigger("bad", "speed_mps > 1"), takes=(take,))
+    assert len(bench.answers) == count
+    assert len(bench.told) == 1
+    bench.recorder.want(Wanted({}, {"b" * 16: {"from_us": 5, "to_us": 1}}))
+    bench.step()
+    assert bench.answers[-1] == {"b" * 16: "a take must span more than 0 and at most 1800 s"}
+
+
+def test_events_fire(tmp_path: Path) -> None:
+    graph = FakeGraph()
+    bench = Bench(tmp_path / "ring", graph, service="/keep", topic="/keep_topic")
+    call = graph.services["/keep"]
+    assert call() == (False, "no trigger is for the service: iort recorder add NAME --on service")
+    bench.want(*(Trigger(on, on=on, cooldown_s=0) for on in ("stop", "disconnect", "service")))
+    assert call() == (True, "kept by service")
+    bench.step()
+    bench.clock.advance(100)
+    graph.hear("/keep_topic", "std_msgs/String", string("near miss"))
+    bench.step()
+    bench.clock.advance(100)
+    bench.recorder.stopped(True)
+    bench.recorder.stopped(True)
+    bench.step()
+    bench.clock.advance(100)
+    bench.connection = Connection(False, DISCONNECT_S + 1, 1)
+    bench.step()
+    bench.step()
+    found = [(one.trigger, one.why) for one in bench.told]
+    assert found == [
+        ("service", "called by a program on the robot"),
+        ("service", "near miss"),
+        ("stop", "the emergency stop came into force"),
+        ("disconnect", "the connection was lost"),
+    ]
+    lost_us = bench.clock.now_us() - round((DISCONNECT_S + 1) * S)
+    assert bench.told[-1].from_us == lost_us - 30 * S
+
+
+def test_an_agent_that_was_never_connected_has_lost_no_connection(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "ring")
+    bench.want(Trigger("disconnect", on="disconnect"))
+    bench.connection = Connection(False, 1000.0, 0)
+    bench.step()
+    assert bench.told == []
+
+
+def play(emit: Emit, stop: threading.Event) -> None:
+    clock, i = SystemClock(), 0
+    while not clock.wait(stop, 0.02):
+        now_us = clock.now_us()
+        emit("vesc", now_us, {"current_input": -20.0 if i == 50 else 0.0})
+        sent.append(cdr(f"message {i}"))
+        emit("chatter", now_us, RosMessage(sent[-1], TEXT))
+        i += 1
+
+
+sent: list[bytes] = []
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[Callable[..., Agent]]:
+    """Starts agents with a recorder, and ends them."""
+    runs: list[tuple[Runtime, threading.Thread]] = []
+
+    def run(**settings: Any) -> Agent:
+        sent.clear()
+        config = Config("car1", "host", Path(), Path(), (Script(play, "vesc", "chatter"),))
+        config = replace(
+            config, recorder=RecorderConfig(folder=tmp_path / "ring", keep_free_mb=0, **settings)
+        )
+        clock = SystemClock()
+        agent = Agent(
+            config, uplink=Loopback(clock, Dispatcher()), spool=MemorySpool(max_bytes=10**9), clock=clock
+        )
+        runtime = Runtime(agent, stopped_s=0.0)
+        thread = threading.Thread(target=lambda: runtime.run(drain_s=0))
+        thread.start()
+        runs.append((runtime, thread))
+        return agent
+
+    yield run
+    for runtime, thread in runs:
+        runtime.stop()
+        thread.join()
+
+
+def test_others_open_the_incident_of_a_running_agent(running: Callable[..., Agent], tmp_path: Path) -> None:
+    agent = running()
+    assert agent.recorder is not None
+    trigger = {**BRAKE, "before_s": 0.5, "after_s": 0.3, "topics": ["/chatter"]}
+    agent.recorder.want(Wanted({"hardbrake": trigger}, {}))
+    folder = tmp_path / "ring" / "incidents"
+    until(lambda: list(folder.glob("*.mcap")), within_s=30.0)
+    (path,) = folder.glob("*.mcap")
+    with path.open("rb") as file:
+        mcap = reader.make_reader(file, validate_crcs=True)
+        summary = mcap.get_summary()
+        messages = [(channel.topic, message.data) for _, channel, message in mcap.iter_messages()]
+        about = {record.name: record.metadata for record in mcap.iter_metadata()}
+    assert summary is not None
+    assert summary.chunk_indexes
+    assert {topic for topic, _ in messages} == {"/chatter"}
+    whole = [data for _, data in messages]
+    first = sent.index(whole[0])
+    assert whole == sent[first : first + len(whole)]
+    assert len(whole) > 30
+    account = json.loads(about["iort.account"]["/chatter"])
+    assert (account["messages"], account["missing"]) == (len(whole), 0)
+    assert json.loads(about["iort.incident"]["agent"])["robot"] == "car1"
+    with highlevel.AnyReader([path]) as bag:
+        assert [data for _, _, data in bag.messages()] == whole
+    report = make_status(agent)
+    assert report.recorder is not None
+    assert report.recorder["waiting"] == 1
+    assert "recorder  " in render(report)
+
+
+def test_the_uploads_tell_the_recorder(running: Callable[..., Agent], tmp_path: Path) -> None:
+    agent = running()
+    assert agent.recorder is not None
+    assert agent.uploads is not None
+    folder = agent.uploads._folders[-1]
+    assert folder.path == tmp_path / "ring" / "incidents"
+    agent.recorder.want(Wanted({"hardbrake": {**BRAKE, "after_s": 0.1, "before_s": 0.1}}, {}))
+    until(lambda: list(folder.path.glob("*.mcap")), within_s=30.0)
+    (path,) = folder.path.glob("*.mcap")
+    (kept,) = agent.recorder.incidents._plan.incidents.values()
+    assert kept.state == KEPT
+    folder.on_uploaded(Path(path.name), kept.key)
+    assert kept.state == UPLOADED
