@@ -147,7 +147,7 @@ class Evaluator:
         for name, (field, age_us) in rule.deltas.items():
             self._deltas.setdefault(field, []).append((name, age_us))
         # The types of each field's values so far, their kinds, and the error if the condition mixes them.
-        self._types: dict[str, set[type]] = {name: set() for name in expression.names(rule.condition)}
+        self._types: dict[str, set[type]] = {name: set() for name in sorted(expression.names(rule.condition))}
         self._kinds: dict[str, frozenset[str]] = dict.fromkeys(self._types, frozenset())
         self._problem = ""
         self._begin()

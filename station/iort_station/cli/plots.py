@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from iort_analysis.samples.positions import PositionFields, fixes, local_metres, position_fields
+from iort_contract.triggers import Edge, Window
 from iort_station.data import Result
 from iort_station.errors import StationError, UsageError
 from iort_station.output import whole
@@ -56,11 +57,51 @@ def over_time(runs: Sequence[Run], fields: Sequence[str], *, from_start: bool = 
     if from_start:
         bottom.set_xlabel("time since the start (s)")
     else:
-        locator = AutoDateLocator(tz=timezone.utc)
-        bottom.xaxis.set_major_locator(locator)
-        bottom.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=timezone.utc))
-        bottom.set_xlabel("time (UTC)")
+        _by_clock(bottom)
     return _finished(figure, runs, "")
+
+
+def moments(
+    lines: Sequence[tuple[str, Result, str]], marks: Mapping[str, tuple[Sequence[Edge], Sequence[Window]]]
+) -> Figure:
+    """Draw a panel for each field of a robot over time, with lines where a trigger fired and bands for the
+    windows that are kept. A robot without fields has a panel with lines and bands alone."""
+    rows: list[tuple[str, Result | None, str]] = [*lines]
+    rows += [(robot, None, "") for robot in marks if robot not in {row[0] for row in lines}]
+    figure, panels = _panels(len(rows), height=1.9, shared=True)
+    for panel, (robot, result, field) in zip(panels, rows, strict=True):
+        edges, windows = marks[robot]
+        for i, window in enumerate(windows):
+            ends = np.array([window.from_us, window.to_us]).astype("datetime64[us]")
+            panel.axvspan(*ends, color=COLOURS[4], alpha=0.25, linewidth=0, label="" if i else "kept")
+        for i, edge in enumerate(edges):
+            at = np.int64(edge.t_us).astype("datetime64[us]")
+            panel.axvline(at, color=COLOURS[1], linewidth=0.9, label="" if i else "fired")
+        if result is not None:
+            run = Run(robot, result)
+            times_us, values = _thinned(result.times_us, _column(run, field))
+            panel.plot(times_us.astype("datetime64[us]"), values, linewidth=1.1, color=COLOURS[0])
+            panel.set_ylabel(_labelled([run], field))
+        else:
+            panel.set_yticks([])
+        if len(marks) > 1:
+            panel.set_title(robot, fontsize=10, loc="left")
+        panel.margins(x=0.01)
+    _by_clock(panels[-1])
+    handles, labels = next(
+        (found for panel in panels if (found := panel.get_legend_handles_labels())[0]), ([], [])
+    )
+    figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False)
+    if len(marks) == 1:
+        figure.suptitle(next(iter(marks)), fontsize=11)
+    return figure
+
+
+def _by_clock(panel: Any) -> None:
+    locator = AutoDateLocator(tz=timezone.utc)
+    panel.xaxis.set_major_locator(locator)
+    panel.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=timezone.utc))
+    panel.set_xlabel("time (UTC)")
 
 
 def trajectory(runs: Sequence[Run]) -> Figure:

@@ -34,6 +34,7 @@ VERBS = {
     "analyse": ("analysis", "Analyse robots' drives in the cloud, now."),
     "findings": ("analysis", "List what the analysis found about drives."),
     "note": ("analysis", "Write, list or delete notes about a robot."),
+    "recorder": ("recorder", "What robots keep of what happened, and when."),
     "calibrate": ("laps", "Print a car's parameters, for vesc.yaml too."),
     "trace": ("live", "Measure the delay of live updates, hop by hop."),
     "watch": ("live", "Show every car in the terminal, live, until Ctrl-C."),

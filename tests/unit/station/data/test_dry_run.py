@@ -1,0 +1,223 @@
+"""A dry-run finds in stored samples the edges that the evaluator finds in the samples themselves."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from iort_contract.messages.batch import Batch
+from iort_contract.messages.recorder import Trigger
+from iort_contract.triggers import Edge, evaluator_of
+from iort_station.cli.verbs import recorder
+from iort_station.cost.incidents import incident_dollars
+from iort_station.data.dry_run import dry_run, fits, lines
+from iort_station.errors import StationError, UsageError
+from testkit.dynamodb import TELEMETRY, item_of
+from tests.recordings import recording
+from tests.trigger_vectors import MS, VECTORS
+from tests.unit.functions.summarizing import drive_of
+from tests.unit.station.data.test_queries import FakeCloud, cloud_of
+
+START = 1_700_000_000_000_000
+S = 1_000_000
+Sample = tuple[str, int, dict[str, Any]]
+
+
+def stored(samples: list[Sample], *, gain: float | None = None) -> FakeCloud:
+    """A cloud with samples as the record lane stores them, a batch for each second of a stream."""
+    cloud = cloud_of(gain=gain)
+    numbers: dict[str, int] = defaultdict(int)
+    seconds: dict[tuple[str, int], list[Sample]] = defaultdict(list)
+    for sample in samples:
+        seconds[sample[0], (sample[1] - START) // S].append(sample)
+    for (stream, _), of in seconds.items():
+        names = dict.fromkeys(name for _, _, values in of for name in values)
+        columns = {name: [values.get(name) for _, _, values in of] for name in names}
+        batch = Batch("0badcafe", numbers[stream], [t_us for _, t_us, _ in of], columns)
+        numbers[stream] += 1
+        cloud.table.put(TELEMETRY, item_of(batch, topic=f"dt/iort/car/{stream}"))
+    return cloud
+
+
+def ride(n: int = 600) -> list[Sample]:
+    """A minute at 10 Hz that brakes three times."""
+    return [
+        (
+            "vesc",
+            START + i * 100 * MS,
+            {"speed": 4_614.0 * 3, "current_input": -20.0 if i % 200 == 150 else 1.0},
+        )
+        for i in range(n)
+    ]
+
+
+BRAKE = Trigger("brake", "current_input < -15 and speed_mps > 2", before_s=5, after_s=5, cooldown_s=0)
+
+
+def as_recorded(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: None if isinstance(of, float) and math.isnan(of) else of for key, of in values.items()}
+
+
+@pytest.mark.parametrize("name", VECTORS)
+def test_its_edges_are_those_of_the_table(name: str) -> None:
+    vector = VECTORS[name]
+    samples = [(stream, START + t_ms * MS, as_recorded(values)) for stream, t_ms, values in vector.samples]
+    gain = vector.vehicle.speed_to_erpm_gain if vector.vehicle else None
+    trigger = Trigger("a", vector.when, others=vector.others)
+    if name == "a missing field is null":
+        with pytest.raises(StationError, match="has no y in vesc in this range"):
+            dry_run(stored(samples), "car", trigger)
+        return
+    if name == "silent: not before the first sample":
+        with pytest.raises(StationError, match="car has no stream scan"):
+            dry_run(stored(samples), "car", trigger)
+        return
+    found = dry_run(stored(samples, gain=gain), "car", trigger)
+    assert found.edges == [Edge(START + t_ms * MS, values) for t_ms, values in vector.edges]
+    assert found.samples == len([s for s in samples if s[0] in evaluator_of(found.trigger).streams])
+
+
+def test_windows_bytes_and_budget_are_told() -> None:
+    found = dry_run(stored(ride(), gain=4614.0), "car", BRAKE)
+    assert [edge.t_us for edge in found.edges] == [START + s * S for s in (15, 35, 55)]
+    assert [(w.from_us, w.to_us) for w in found.windows] == [
+        (START + (s - 5) * S, START + (s + 5) * S) for s in (15, 35, 55)
+    ]
+    (upload,) = found.uploads
+    assert upload.stream == "vesc"
+    # The last window ends with the ride.
+    assert upload.messages == 101 + 101 + 100
+    assert found.within_budget == found.bytes > 302 * 30
+    third = Trigger(**{**vars(BRAKE), "budget_mb_day": found.bytes / 1e6 / 2})
+    assert dry_run(stored(ride(), gain=4614.0), "car", third).within_budget == round(found.bytes / 3)
+    only = Trigger(**{**vars(BRAKE), "topics": ("/camera/*",)})
+    assert dry_run(stored(ride(), gain=4614.0), "car", only).uploads == []
+
+
+def test_a_cooldown_and_a_range_leave_edges_out() -> None:
+    cloud = stored(ride(), gain=4614.0)
+    cooled = dry_run(cloud, "car", Trigger(**{**vars(BRAKE), "cooldown_s": 30}))
+    assert (len(cooled.edges), len(cooled.windows)) == (3, 2)
+    part = dry_run(cloud, "car", BRAKE, START + 20 * S, START + 55 * S)
+    assert [edge.t_us for edge in part.edges] == [START + 35 * S]
+    assert (part.first_us, part.last_us) == (START + 20 * S, START + 55 * S - 100 * MS)
+
+
+def test_a_stream_is_silent_while_others_go_on() -> None:
+    samples = [*ride(100), *[("scan", START + i * S, {"a": 1}) for i in range(3)]]
+    found = dry_run(stored(samples), "car", Trigger("a", "silent(scan, 1500ms)"))
+    assert [edge.t_us for edge in found.edges] == [START + 3_500 * MS]
+
+
+@pytest.mark.parametrize(
+    ("trigger", "error", "told"),
+    [
+        (Trigger("a", "sped > 2"), StationError, "car has no sped in vesc in this range"),
+        (Trigger("a", "speed > 2", stream="scan"), StationError, "car has no stream scan"),
+        (Trigger("a", "silent(scan, 1s)"), StationError, "car has no stream scan"),
+        (Trigger("a", "speed == 'map'"), StationError, "cannot compare a number with a text"),
+        (Trigger("a", "speed >"), UsageError, "invalid expression"),
+        (Trigger("a", "speed_mps > 2"), UsageError, "speed_mps needs the vehicle's parameters"),
+        (Trigger("a", on="stop"), UsageError, "a is fired by stop, which no stored sample tells"),
+    ],
+)
+def test_what_is_not_there_or_not_allowed_is_said(
+    trigger: Trigger, error: type[Exception], told: str
+) -> None:
+    with pytest.raises(error) as raised:
+        dry_run(stored(ride(10)), "car", trigger)
+    assert told in str(raised.value)
+
+
+def test_an_empty_range_has_no_edges() -> None:
+    found = dry_run(stored(ride(10), gain=4614.0), "car", BRAKE, START - 10 * S, START - 5 * S)
+    assert (found.samples, found.edges, found.windows, found.first_us) == (0, [], [], None)
+    assert list(lines(FakeCloud(None), found, None, None)) == []
+
+
+def test_patterns_are_of_topics_and_streams() -> None:
+    assert fits(("/camera/*",), "image", "/camera/left/image")
+    assert fits(("vesc",), "vesc")
+    assert not fits(("/camera", "vesc."), "vesc1", "/camera/left")
+
+
+class Chosen:
+    """The verb's context: a cloud that is chosen already."""
+
+    def __init__(self, cloud: FakeCloud) -> None:
+        self._cloud = cloud
+
+    def cloud(self) -> FakeCloud:
+        return self._cloud
+
+
+def run(cloud: FakeCloud, *options: str) -> Any:
+    app = typer.Typer()
+    app.add_typer(recorder.commands)
+    return CliRunner().invoke(app, ["recorder", "dry-run", "--robots", "car", *options], obj=Chosen(cloud))
+
+
+BRAKING = ("--when", BRAKE.when, "--last", "all", "--before", "5s", "--after", "5s", "--cooldown", "0")
+
+
+def test_the_verb_prints_times_and_values_and_draws_them(tmp_path) -> None:
+    cloud = stored(ride(), gain=4614.0)
+    shown = run(cloud, *BRAKING, "--out", str(tmp_path / "when.png"))
+    assert shown.exit_code == 0, shown.output
+    assert "would have fired 3 times (600 samples" in shown.stdout
+    assert "current_input -20, speed_mps 3" in shown.stdout
+    assert "3 incidents would be kept, 30 s in all" in shown.stdout
+    assert (tmp_path / "when.png").stat().st_size > 10_000
+    done = run(cloud, *BRAKING, "--json")
+    assert done.exit_code == 0, done.exception
+    (told,) = json.loads(done.stdout)
+    assert [edge["time_us"] for edge in told["edges"]] == [START + s * S for s in (15, 35, 55)]
+    assert told["edges"][0]["values"] == {"current_input": -20, "speed_mps": 3}
+    assert len(told["windows"]) == 3
+    upload, stored_usd = incident_dollars(3, told["bytes_within_budget"])
+    assert (told["dollars"], told["dollars_a_month"]) == (upload, stored_usd)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ((), "give either the name of a trigger that the robots have, or --when"),
+        (("brake", "--when", "speed > 1"), "give either the name"),
+        (("--when", "speed > "), "invalid expression"),
+        (("--when", "speed > 1", "--budget", "5"), "--budget must be MB or GB a day"),
+        (("--when", "speed > 1", "--before", "1h"), "before must be 0 to 600 s, got 3600"),
+        (("--when", "speed > 1", "--out", "when.gif"), "must end in"),
+    ],
+)
+def test_wrong_use_is_said(options: tuple[str, ...], told: str) -> None:
+    done = run(stored(ride(10)), *options)
+    assert isinstance(done.exception, UsageError)
+    assert told in str(done.exception)
+
+
+@pytest.mark.parametrize(
+    "when",
+    ["speed_mps > 1 and current_input < 0", "delta(speed, 500ms) < -1000", "duty_cycle > 0.1 for 500ms"],
+)
+def test_a_recorded_drive_has_the_same_edges_in_the_table_as_on_the_car(when: str) -> None:
+    drive = list(drive_of(recording("f1tenth-motor-servo.bag")))
+    samples = [("vesc", START + t_us - drive[0][0], values) for t_us, values in drive]
+    trigger = Trigger("a", when, gain=4614.0)
+    found = dry_run(stored(samples), "car", trigger)
+    evaluator = evaluator_of(trigger)
+    edges = [edge for sample in samples for edge in evaluator.sample(*sample)] + [*evaluator.finish()]
+    assert len(edges) > 2
+    assert found.edges == edges
+
+
+def test_incidents_cost_their_requests_and_a_month_of_storage() -> None:
+    assert incident_dollars(0, 0) == (0.0, 0.0)
+    few, many = incident_dollars(1, 10**9), incident_dollars(1, 10**10)
+    assert many[1] == pytest.approx(10 * few[1]) == pytest.approx(0.23)
+    assert few[0] < many[0] < 0.02
