@@ -114,16 +114,18 @@ class RingFolder:
 
     # --- bounds ------------------------------------------------------------------------------------
 
-    def evict(self, now_us: int) -> int:
-        """Delete what the bounds do not allow; the bytes of the disk that others lack even so, 0 if none.
+    def evict(self, now_us: int, *, stopped: bool) -> int:
+        """Delete what the bounds do not allow; the bytes of the disk that others lack even so, 0 if none. A
+        ring that ``stopped`` needs room for a segment, too, so that it does not begin in vain.
         Raises `OSError`."""
         self._fit()
         since_us = now_us - round(self._config.max_age_s * 1e6)
         while self._segments and self._segments[0].to_us < since_us:
             self._evict_one(AGE)
+        reserve = self._reserve + (_ROOM_BYTES if stopped else 0)
         while True:
             disk = os.statvfs(self.path)
-            lacking = self._reserve - disk.f_bavail * disk.f_frsize
+            lacking = reserve - disk.f_bavail * disk.f_frsize
             if lacking <= 0 or not self._evict_one(FULL):
                 return max(0, lacking)
 

@@ -57,6 +57,8 @@ _log = logging.getLogger(__name__)
 LOOK_S = 0.2
 # Bytes that wait and do not wait for the next look.
 _HURRY_BYTES = 4 * 1024 * 1024
+# Of a topic that is dropped, the list of drops has a line for each of these times.
+_TELL_S = 1.0
 # Messages that the thread takes at once.
 _TOGETHER = 256
 # What keeping a message in memory takes beside its bytes, and each of a sample's fields.
@@ -97,6 +99,7 @@ class Ring:
         self._most_bytes = round(config.memory_mb * 1e6)
         self._hurry_bytes = min(_HURRY_BYTES, self._most_bytes // 2)
         self._flushes: list[threading.Event] = []
+        self._told_at = clock.monotonic()
 
         self._kick, self._ending = threading.Event(), threading.Event()
         self._thread = Supervised("ring", self._work_until_end)
@@ -285,7 +288,10 @@ class Ring:
                 with self._ledger.lock:
                     self._bytes -= sum(item[5] for item in items)
         self._writer.tick(self.now_us(), flush=bool(flushes), ending=ending)
-        self._folder.add_drops(self._ledger.drops(take=True))
+        now = self._clock.monotonic()
+        if ending or now - self._told_at >= _TELL_S:
+            self._told_at = now
+            self._folder.add_drops(self._ledger.drops(take=True))
         for done in flushes:
             done.set()
 

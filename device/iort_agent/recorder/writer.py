@@ -178,11 +178,11 @@ class RingWriter:
     def _keep_bounds(self, now_us: int) -> None:
         """Delete old segments, and stop while the disk is too full even without them."""
         try:
-            lacking = self._folder.evict(now_us)
+            lacking = self._folder.evict(now_us, stopped=self._stopped)
             if lacking:
                 # The open one, too, must not stand in others' way.
                 self._end_segment()
-                lacking = self._folder.evict(now_us)
+                lacking = self._folder.evict(now_us, stopped=self._stopped)
         except OSError as error:
             self._stop(f"the ring's folder {self._folder.path}: {error.strerror or error}")
             return
