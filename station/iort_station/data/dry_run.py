@@ -85,7 +85,7 @@ def stored_trigger(cloud: Cloud, robot: str, name: str) -> Trigger:
     if name not in triggers:
         known = list(triggers)
         problem = f"{robot} has no trigger {name}"
-        raise unknown(problem, [name], known, f"iort recorder list --robot {robot}")
+        raise unknown(problem, [name], known, f"iort recorder list {robot}")
     try:
         return decode_trigger(name, triggers[name])
     except ContractError as error:

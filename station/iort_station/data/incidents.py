@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 from iort_analysis.samples.blocks import values
 from iort_contract.catalog.streams import INCIDENT_STREAM
 from iort_contract.limits import ContractError, Value
-from iort_contract.messages.recorder import KEPT, MAX_SPAN_S, Incident, incident
+from iort_contract.messages.recorder import KEPT, MAX_SPAN_S, TAKE, Incident, Take, incident, incident_id
 from iort_station.cloud import Cloud
 from iort_station.data.findings import robots_of
 from iort_station.data.queries import samples
@@ -41,6 +41,27 @@ def incidents(
         each = list(pool.map(lambda name: list(_of(cloud, name, start_us, end_us)), robots))
     found = [one for some in each for one in some]
     return sorted(found, key=lambda one: (-one.incident.from_us, one.robot, one.incident.id))
+
+
+def of_take(
+    cloud: Cloud, robot: str, taken: Take, before: Collection[RobotIncident] = ()
+) -> RobotIncident | None:
+    """What has become of a take; None if the cloud knows nothing of it yet.
+
+    A take whose time overlaps an open incident becomes a part of that one. ``before`` are the incidents as
+    they were before the take.
+    """
+    found = incidents(cloud, robot, taken.from_us, taken.to_us)
+    own = incident_id(robot, taken.id, 0)
+    part_of = (
+        one
+        for one in found
+        if one not in before
+        and TAKE in one.incident.trigger.split(",")
+        and one.incident.from_us <= taken.from_us
+        and taken.to_us <= one.incident.to_us
+    )
+    return next((one for one in found if one.incident.id == own), None) or next(part_of, None)
 
 
 def _of(cloud: Cloud, robot: str, start_us: int | None, end_us: int | None) -> Iterator[RobotIncident]:

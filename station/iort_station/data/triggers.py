@@ -10,6 +10,7 @@ from dataclasses import replace
 from iort_analysis.samples.blocks import Block, values
 from iort_contract import triggers
 from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES
+from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.expression import ExpressionError, MismatchError
 from iort_contract.limits import ContractError
 from iort_contract.messages.recorder import Trigger
@@ -33,16 +34,19 @@ def checked(cloud: Cloud, robot: str, trigger: Trigger, *, new: bool = False) ->
     """
     try:
         rule = triggers.rule_of(trigger)
-        streams = set(inventory.check_recorded(cloud, robot))
+        # The recorder hears what a robot's sources give, and not what its agent says.
+        streams = set(inventory.check_recorded(cloud, robot)) - OWN_STREAMS
         if rule is not None:
             trigger = _with_streams(rule, trigger, streams)
             trigger = _with_vehicle(cloud, robot, rule, trigger)
         triggers.check_trigger(trigger)
     except (ContractError, ExpressionError) as error:
         raise UsageError(f"{error}; nothing is changed") from error
+    evaluator = triggers.evaluator_of(trigger)
+    if evaluator is not None and (own := evaluator.streams & OWN_STREAMS):
+        raise UsageError(f"{min(own)} is the agent's own stream, which fires no trigger; nothing is changed")
     if new:
         return trigger
-    evaluator = triggers.evaluator_of(trigger)
     if evaluator is not None:
         _check_fires(cloud, robot, evaluator, streams)
     _check_topics(cloud, robot, trigger.topics, streams)

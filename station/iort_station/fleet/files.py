@@ -68,6 +68,23 @@ def listed(
                 yield StoredFile(entry["Key"], key.robot, key.name, entry["Size"], key.second, stored_s)
 
 
+def stored(cloud: Cloud, key: str) -> StoredFile | None:
+    """The file of a key; None if the bucket does not have it (any more)."""
+    client = cloud.client("s3")
+    try:
+        named = parse_file_key(key)
+        head = client.head_object(Bucket=_bucket(cloud), Key=key)
+    except ContractError as error:
+        raise StationError(str(error)) from error
+    except ClientError as error:
+        if error.response["Error"]["Code"] in {"404", "NoSuchKey"}:
+            return None
+        raise
+    return StoredFile(
+        key, named.robot, named.name, head["ContentLength"], named.second, head["LastModified"].timestamp()
+    )
+
+
 def download(
     cloud: Cloud,
     file: StoredFile,

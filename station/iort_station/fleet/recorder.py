@@ -46,6 +46,11 @@ class Answer(NamedTuple):
     text: str
     online: bool
 
+    @property
+    def refused(self) -> bool:
+        """Whether the robot says why not."""
+        return self.text not in {"", ACCEPTED}
+
 
 def triggers(cloud: Cloud, robot: str) -> list[RobotTrigger]:
     """The triggers that a robot is to have, by name, beside its answers."""
@@ -82,7 +87,7 @@ def add(cloud: Cloud, robot: str, trigger: Trigger, seconds: float, *, withdraw:
 
     _change(shadow, change)
     answer = _answer(shadow, cloud, trigger.name, seconds, old.reported.recorder.get(trigger.name, ""))
-    if withdraw and answer.text not in {"", ACCEPTED}:
+    if withdraw and answer.refused:
         _change(shadow, lambda _: _restored(old, trigger.name))
     return answer
 

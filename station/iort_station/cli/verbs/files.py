@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -73,6 +73,14 @@ def get(
         found = [_newest(found, robot, one) for one in which]
     if not found:
         raise StationError(f"{robot} has no matching files")
+    fetch(cloud, found, out, force=force, as_json=as_json)
+
+
+def fetch(cloud: Cloud, found: Sequence[StoredFile], out: Path, *, force: bool, as_json: bool) -> None:
+    """Download files into a folder and print their paths; those of the same name get a folder for each time.
+
+    Raises `StationError` at the end if some could not be fetched; each is named.
+    """
     apart = len({one.name for one in found}) < len(found)
     failed = 0
     for one in found:

@@ -1,4 +1,4 @@
-"""`iort recorder`: the triggers of robots' event recorders."""
+"""`iort recorder dry-run`, and the options of a trigger; `triggers` has the other verbs of the group."""
 
 from __future__ import annotations
 
