@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from typing import Any, Callable, Mapping, NamedTuple
+from typing import Any, Callable, Mapping, Tuple
 
 from iort_agent.common.schema import did_you_mean
 from iort_agent.recorder.plan import Edge, Plan
@@ -48,11 +48,8 @@ _HOUR_US = 3_600_000_000
 OnEdge = Callable[[Trigger, Edge, int], None]
 
 
-class _Heard(NamedTuple):
-    stream: str
-    t_us: int
-    ring_us: int
-    values: Mapping[str, Value]
+# A sample: its stream and time, the ring's time, and its values.
+_Heard = Tuple[str, int, int, Mapping[str, Value]]
 
 
 class _Armed:
@@ -81,12 +78,12 @@ class _Armed:
         if evaluator is None or self.problem:
             return []
         began, streams = time.thread_time_ns(), evaluator.streams
-        for i, heard in enumerate(batch):
-            if heard.stream in streams:
+        for i, (stream, t_us, heard_us, sample) in enumerate(batch):
+            if stream in streams:
                 self.samples += 1
-                self._note(heard)
-                for t_us, values in evaluator.sample(heard.stream, heard.t_us, heard.values):
-                    found.append((self._edge(t_us, values), _ring_us(heard.ring_us, heard.t_us, t_us)))
+                self._note(stream, t_us, heard_us, sample)
+                for edge_us, values in evaluator.sample(stream, t_us, sample):
+                    found.append((self._edge(edge_us, values), _ring_us(heard_us, t_us, edge_us)))
             if not i % _LOOK_AT_COST and time.thread_time_ns() - began > _MAX_AT_ONCE_NS:
                 break
         t_us, at_us = self._newest
@@ -112,8 +109,7 @@ class _Armed:
         """Microseconds of a core for a sample."""
         return round(self.busy_ns / 1000 / max(1, self.samples), 2)
 
-    def _note(self, heard: _Heard) -> None:
-        stream, t_us, ring_us, values = heard
+    def _note(self, stream: str, t_us: int, ring_us: int, values: Mapping[str, Value]) -> None:
         self._newest = (t_us, ring_us)
         if self._first_us is None:
             self._first_us = t_us
@@ -193,9 +189,10 @@ class Triggers:
             if len(self._inbox) >= _MAX_INBOX or self._bytes > _MAX_INBOX_BYTES:
                 self.unseen += 1
                 return
-            # Not exact, since several threads count; `step` begins anew.
-            self._bytes += len(values.raw) if isinstance(values, RosMessage) else 0
-            self._inbox.append(_Heard(stream, t_us, self._now_us(), values))
+            # Not exact, since several threads count; `step` begins anew. `isinstance` would take longer.
+            if type(values) is RosMessage:
+                self._bytes += len(values.raw)
+            self._inbox.append((stream, t_us, self._now_us(), values))
 
     def desire(self, triggers: Mapping[str, Any]) -> None:
         """Put these in force instead of the others, also after a restart."""
