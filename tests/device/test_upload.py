@@ -15,7 +15,7 @@ from iort_agent.config import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
 from iort_agent.files.folder import STATE, Folder, Uploads
-from iort_agent.files.upload import ByteRate, Outcome, Sender, make_uploader, trusting
+from iort_agent.files.upload import ByteRate, GaveWayError, Outcome, Sender, make_uploader, trusting
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.status import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
@@ -30,6 +30,7 @@ from iort_contract.messages.files import (
 from iort_contract.topics import FILE, PING, build_topic
 from testkit.agent import Loopback, ManualClock, link_of
 from tests.store_standin import store
+from tests.unit.agent.recorder import rig as recorder_rig
 from tests.unit.agent.test_agent import config_file
 
 
@@ -431,3 +432,91 @@ def test_the_command_gives_advice_while_an_agent_runs(tmp_path, bags):
             list(upload_files(load_config(file), [file], status_socket=tmp_path / SOCKET))
     finally:
         server.stop()
+
+
+# --- what gives way to others -----------------------------------------------------------------------
+
+
+def test_a_file_gives_way_after_a_part_and_goes_on_with_the_next(rig, large):
+    local = read(large.parent, PurePath(large.name), stop=rig.stop)
+    for _ in range(2):
+        with pytest.raises(GaveWayError):
+            rig.uploader.upload(local, rig.stop, gives_way=lambda: True)
+    assert rig.uploader.upload(local, rig.stop, gives_way=lambda: True) == file_key("car", local.file)
+    assert rig.store.puts == [1, 2, 3]
+
+
+class Courier:
+    """An uploader that notes what it is given, and gives way when it may."""
+
+    def __init__(self):
+        self.names = []
+        self.meanwhile = lambda: None
+        self.sent_bytes = 0
+
+    def upload(self, local, _stop, _progress, gives_way):
+        self.names.append(local.name.name)
+        self.meanwhile()
+        if gives_way():
+            raise GaveWayError("gives way", again_s=0)
+        return f"robots/car/{local.name}"
+
+
+def test_incidents_are_uploaded_last_and_told(rig, tmp_path):
+    courier, told = Courier(), []
+    first, last = tmp_path / "first", tmp_path / "last"
+    for path in (first, last):
+        path.mkdir()
+    (last / "incident.mcap").write_bytes(b"1")
+    folders = [
+        Folder(first, clock=rig.clock, settle_s=0, remove_after_s=None),
+        Folder(
+            last,
+            clock=rig.clock,
+            settle_s=0,
+            remove_after_s=0,
+            on_uploaded=lambda name, key: told.append((name, key, (last / name).exists())),
+        ),
+    ]
+    uploads = Uploads(folders=folders, uploader=courier, clock=rig.clock)
+    courier.meanwhile = lambda: (first / "image.jpg").write_bytes(b"2")
+    assert uploads.step(rig.stop)
+    assert told == []
+    courier.meanwhile = lambda: None
+    assert uploads.step(rig.stop)
+    assert uploads.step(rig.stop)
+    assert courier.names == ["incident.mcap", "image.jpg", "incident.mcap"]
+    assert told == [(PurePath("incident.mcap"), "robots/car/incident.mcap", True)]
+    assert list(last.glob("*.mcap")) == []
+    assert uploads.status().last_error is None
+
+
+def test_an_incident_reaches_the_bucket_after_a_refusal_and_a_restart(rig, tmp_path):
+    recorder = recorder_rig.Rig(tmp_path / "ring", triggers={"hardbrake": recorder_rig.BRAKE})
+    recorder.pass_s(6)
+    recorder.brake()
+    recorder.pass_s(5)
+    recorder.cut()
+    (path,) = recorder.files.glob("*.mcap")
+    content = path.read_bytes()
+
+    def folder(of):
+        return Folder(
+            of.files,
+            clock=rig.clock,
+            settle_s=0,
+            remove_after_s=0,
+            on_uploaded=of.incidents.uploaded,
+        )
+
+    rig.store.refusals = [("quota", 60)]
+    uploads = Uploads(folders=[folder(recorder)], uploader=rig.uploader, clock=rig.clock)
+    assert uploads.step(rig.stop)
+    recorder = recorder.again()
+    uploads = Uploads(folders=[folder(recorder)], uploader=rig.uploader, clock=rig.clock)
+    assert uploads.step(rig.stop)
+    recorder.settle()
+    assert rig.store.objects == {recorder.told[-1].key: content}
+    assert recorder.states() == ["kept", "uploaded"]
+    assert recorder.plan.incidents == {}
+    assert list(recorder.files.glob("*.mcap")) == []

@@ -14,7 +14,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Callable, Iterator, NamedTuple
+from typing import Callable, Iterator, NamedTuple, Sequence
 
 from iort_agent.common.private_files import folder_of, open_below, write_below
 from iort_agent.common.schema import FOLDER, number, path, setting
@@ -22,7 +22,7 @@ from iort_agent.common.state import Files
 from iort_agent.common.threads import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import LocalFile, Look, look_at, read, unreadable
-from iort_agent.files.upload import Uploader
+from iort_agent.files.upload import GaveWayError, Uploader
 
 _log = logging.getLogger(__name__)
 
@@ -280,7 +280,8 @@ _NICE = 10
 
 
 class Uploads:
-    """Uploads until it is stopped."""
+    """Uploads until it is stopped. After each part, a file of a later folder gives way to those of earlier
+    ones."""
 
     def __init__(self, *, folders: list[Folder], uploader: Uploader, clock: Clock) -> None:
         self._folders, self._uploader, self._clock = folders, uploader, clock
@@ -305,10 +306,10 @@ class Uploads:
 
     def step(self, stop: threading.Event) -> bool:
         """Upload the next file; False if there is none."""
-        for folder in self._folders:
+        for i, folder in enumerate(self._folders):
             name = folder.next()
             if name is not None:
-                self._upload(folder, name, stop)
+                self._upload(folder, name, stop, self._folders[:i])
                 return True
         return False
 
@@ -323,11 +324,16 @@ class Uploads:
             last_error=self._last_error,
         )
 
-    def _upload(self, folder: Folder, name: Path, stop: threading.Event) -> None:
+    def _upload(self, folder: Folder, name: Path, stop: threading.Event, earlier: Sequence[Folder]) -> None:
+        def gives_way() -> bool:
+            return any(other.next() is not None for other in earlier)
+
         self._current, self._current_bytes = str(name), 0
         try:
             local = folder.local(name, stop)
-            key = self._uploader.upload(local, stop, self._progress)
+            key = self._uploader.upload(local, stop, self._progress, gives_way)
+        except GaveWayError:
+            _log.debug("files: %s gives way to others", folder.path / name)
         except UploadError as error:
             if not stop.is_set():
                 self._last_error = str(error)

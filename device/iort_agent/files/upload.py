@@ -206,6 +206,10 @@ _AGAIN_S = 300.0
 Progress = Callable[[int], None]
 
 
+class GaveWayError(UploadError):
+    """The rest of a file waits for others."""
+
+
 class Uploader:
     """Uploads files, one at a time."""
 
@@ -221,12 +225,17 @@ class Uploader:
         return self._sender.sent_bytes
 
     def upload(
-        self, local: LocalFile, stop: threading.Event, progress: Progress = lambda _bytes: None
+        self,
+        local: LocalFile,
+        stop: threading.Event,
+        progress: Progress = lambda _bytes: None,
+        gives_way: Callable[[], bool] = lambda: False,
     ) -> str:
         """Upload a file. Returns its key once the bucket has the whole file.
 
         ``progress`` is called with the bytes that the bucket has. Raises `UploadError` if the cloud refuses
-        the file, if it changes, after several tries without progress, and when ``stop`` is set.
+        the file, if it changes, after several tries without progress, and when ``stop`` is set; and
+        `GaveWayError` if it ``gives_way`` after a part.
         """
         transfer = _Transfer(local)
         tries, why = 0, ""
@@ -245,7 +254,7 @@ class Uploader:
                 progress(local.look.size)
                 return str(answer.key)
             else:
-                why = self._send(transfer, answer, stop, progress)
+                why = self._send(transfer, answer, stop, progress, gives_way)
             if len(transfer.there) > before:
                 tries = 0
                 continue
@@ -272,7 +281,12 @@ class Uploader:
         return wait.answer
 
     def _send(
-        self, transfer: _Transfer, answer: FileAnswer, stop: threading.Event, progress: Progress
+        self,
+        transfer: _Transfer,
+        answer: FileAnswer,
+        stop: threading.Event,
+        progress: Progress,
+        gives_way: Callable[[], bool],
     ) -> str:
         """Send the parts that have an address. Returns why it ended; an empty text if all are sent."""
         local = transfer.local
@@ -289,6 +303,8 @@ class Uploader:
                 return put.text
             transfer.there.add(address.part)
             progress(transfer.bytes_there())
+            if len(transfer.there) < local.file.parts and gives_way():
+                raise GaveWayError(f"{local.path}: gives way", again_s=0)
         return ""
 
 
