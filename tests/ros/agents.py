@@ -45,13 +45,19 @@ class Agent(NamedTuple):
         return int(self.status().get("streams", {}).get(stream, {}).get("samples", 0))
 
 
-def agent_of(graph: Graph, folder: Path, *sources: dict[str, Any], arguments: tuple[str, ...] = ()) -> Agent:
-    """Return the real agent in a graph, without a reachable broker."""
+def agent_of(
+    graph: Graph,
+    folder: Path,
+    *sources: dict[str, Any],
+    arguments: tuple[str, ...] = (),
+    more: str = "",
+) -> Agent:
+    """Return the real agent in a graph, without a reachable broker; ``more`` are lines of its car.yaml."""
     command = (
         "iort_agent.cli",
         "run",
         "--config",
-        configuration(folder, *sources),
+        configuration(folder, *sources, more=more),
         "--drain-s",
         0,
         *arguments,
@@ -59,10 +65,10 @@ def agent_of(graph: Graph, folder: Path, *sources: dict[str, Any], arguments: tu
     return Agent(graph.module(*map(str, command)), folder)
 
 
-def configuration(folder: Path, *sources: dict[str, Any]) -> Path:
+def configuration(folder: Path, *sources: dict[str, Any], more: str = "") -> Path:
     """Return the car.yaml of an agent without a reachable broker."""
     text = yaml.safe_dump(list(sources), default_flow_style=True, width=1000).strip()[1:-1]
-    config = config_file(folder, text, "queue: {path: queue.db}\nport: 1")
+    config = config_file(folder, text, f"queue: {{path: queue.db}}\nport: 1\n{more}")
     self_signed(folder)
     for made, named in (("private.key", "key.pem"), ("certificate.pem", "cert.pem")):
         (folder / made).replace(folder / named)

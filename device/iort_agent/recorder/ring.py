@@ -308,9 +308,11 @@ class _Kept:
             # A message's type is with it; of streams that are not recorded, nobody else needs it.
             return 0.0 if values.get("stream") in only else self._emit(stream, t_us, values, more=more)
         self._ring.take(stream, t_us, values)
+        nothing = stream in only
         if isinstance(values, Selected):
             values.whole = None  # the lanes need not hold it
-        if stream in only:
+            nothing |= not values
+        if nothing:
             return self._ring.missed_at()
         return self._emit(stream, t_us, values, more=more)
 

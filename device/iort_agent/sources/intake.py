@@ -63,7 +63,8 @@ class TopicConfig:
 
 
 class Selected(Dict[str, Any]):
-    """The selected fields of a message; ``whole`` is the message, for the event recorder."""
+    """The selected fields of a message; ``whole`` is the message, for the event recorder, which takes it also
+    if there are no fields."""
 
     whole: RosMessage | None = None
 
@@ -234,16 +235,21 @@ class Intake:
             except MessageError as error:
                 if self._config.fields:
                     self.warn("malformed", str(error))
-                    return None
+                    return self._selected({}, kind, data, arrival_us)
                 self.warn("undecodable", f"kept as it is: {error}")
         if kind.decoder is None or not self._config.fields:
             contents = {name: value for name, value in values.items() if isinstance(value, Large) and value}
             return RosMessage(data, kind.whole, large=contents, arrival_us=arrival_us)
         if not values:
             self.warn("empty", "its messages have no field to send")
-            return None
+        return self._selected(values, kind, data, arrival_us)
+
+    def _selected(
+        self, values: dict[str, Any], kind: Kind, data: bytes, arrival_us: int
+    ) -> Mapping[str, Value] | None:
+        """The fields, with the whole message if somebody takes it; None without both."""
         if not self._whole:
-            return values
+            return values or None
         selected = Selected(values)
         selected.whole = RosMessage(data, kind.whole, arrival_us=arrival_us)
         return selected

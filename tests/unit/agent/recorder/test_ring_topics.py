@@ -82,10 +82,11 @@ def test_a_topic_for_the_ring_alone_is_heard_and_not_recorded(
     topics = (
         ("/imu", TopicConfig(time="arrival", stream="imu", fields=("v",))),
         ("/speed", TopicConfig(time="arrival", stream="speed", only="ring", fields=("v",))),
+        ("/none", TopicConfig(time="arrival", stream="none", fields=("absent",))),
         ("/camera/*", TopicConfig(time="arrival", only="ring", large="upload")),
     )
     config = Config(topics)
-    assert (config.streams(), config.only_ring()) == (["imu"], ["speed"])
+    assert (config.streams(), config.only_ring()) == (["imu", "none"], ["speed"])
     assert not config.uploads_large(), "nothing of it is uploaded"
     clock, stop = ManualClock(), threading.Event()
     run = SourceRun(config, clock, whole=True)
@@ -102,12 +103,12 @@ def test_a_topic_for_the_ring_alone_is_heard_and_not_recorded(
     clock.advance(1)
     ring.work()
     kept = {message.channel.topic: message for message in ring.read(0, 2**62)}
-    assert set(kept) == {"/imu", "/speed", "/camera/image"}
+    assert set(kept) == {"/imu", "/speed", "/none", "/camera/image"}
     assert {message.data for message in kept.values()} == {b"\x01\x02"}, "whole"
     assert kept["/camera/image"].channel.stream == "camera-image"
     assert [(stream, values) for stream, values in recorded if stream != TYPES_STREAM] == [("imu", {"v": 2})]
-    assert [values["stream"] for stream, values in recorded if stream == TYPES_STREAM] == ["imu"]
-    assert set(run.source.report()) == {"/imu", "/speed", "/camera/image"}
+    assert [values["stream"] for stream, values in recorded if stream == TYPES_STREAM] == ["imu", "none"]
+    assert set(run.source.report()) == {"/imu", "/speed", "/none", "/camera/image"}
     ring.close()
 
 
