@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import uuid
 from dataclasses import replace
@@ -25,7 +26,8 @@ from iort_agent.config import Config
 from iort_agent.control.commands import Operator, refuse_commands
 from iort_agent.control.downlink import make_downlink
 from iort_agent.control.guard import NODES, StopFile
-from iort_agent.control.shadow import Shadow
+from iort_agent.control.shadow import NO_RECORDER, Shadow
+from iort_agent.errors import AgentError
 from iort_agent.files.folder import make_uploads
 from iort_agent.files.upload import make_uploader
 from iort_agent.lanes import RuntimeSettings
@@ -39,6 +41,7 @@ from iort_agent.metrics import Accounts, AgentMetrics, Rates
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
 from iort_agent.recorder.recorder import Recorder
+from iort_agent.recorder.segment import require_mcap
 from iort_agent.ros import Graph
 from iort_agent.ros.ros1_node import DEFAULT_NODE
 from iort_agent.sources.registry import SourceRun
@@ -47,6 +50,8 @@ from iort_agent.spool import Spool
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.cloud import IOT
 from iort_contract.limits import Value
+
+_log = logging.getLogger(__name__)
 
 
 def agent_version() -> str:
@@ -116,6 +121,8 @@ class Agent:
             for source in config.sources
         ]
         graph = next((run.source.graph for run in self.sources if isinstance(run.source, SimSource)), None)
+        # Why the recorder does not work, although the configuration has one.
+        self.no_recorder: str | None = None
         self.recorder = self._make_recorder(graph)
         self.shadow = Shadow(
             link,
@@ -127,6 +134,7 @@ class Agent:
             drive=config.downlink.drive_limits(),
             moves=config.downlink.moves(),
             recorder=self.recorder,
+            no_recorder=self.no_recorder or NO_RECORDER,
         )
         if self.recorder is not None:
             self.recorder.on_answers = self.shadow.tell
@@ -191,7 +199,7 @@ class Agent:
 
     def _make_recorder(self, graph: Graph | None) -> Recorder | None:
         """The recorder of a configuration that has one. A program's service and topic are in the ROS node of
-        the sources, or in a ``graph`` that is no ROS graph."""
+        the sources, or in a ``graph`` that is no ROS graph. Raises `AgentError` without the package mcap."""
         config = self.config
         if config.recorder is None:
             return None
@@ -200,19 +208,26 @@ class Agent:
             graph = None
         elif graph is None or ros.node is not None:
             graph = NODES[ros.version](ros.node or DEFAULT_NODE, self.clock)
-        return Recorder(
-            config.recorder,
-            self.clock,
-            robot=config.robot,
-            run=self.boot,
-            reserve=config.queue.max_bytes,
-            tell=lambda stream, t_us, values: self.streams.emit(stream, t_us, values, urgent=True),
-            connection=self.uplink.status,
-            reports=[source.report for source in self.sources],
-            replayed=self._replayed,
-            agent=self._state,
-            graph=graph,
-        )
+        require_mcap()
+        try:
+            return Recorder(
+                config.recorder,
+                self.clock,
+                robot=config.robot,
+                run=self.boot,
+                reserve=config.queue.max_bytes,
+                tell=lambda stream, t_us, values: self.streams.emit(stream, t_us, values, urgent=True),
+                connection=self.uplink.status,
+                reports=[source.report for source in self.sources],
+                replayed=self._replayed,
+                agent=self._state,
+                graph=graph,
+            )
+        except AgentError as error:
+            # A disk that fails costs the incidents, and neither samples nor stops.
+            self.no_recorder = f"the recorder does not work: {error}"
+            _log.error("%s", self.no_recorder)
+            return None
 
     def _state(self) -> dict[str, Any]:
         """The agent at an edge, for the incident's file."""
@@ -310,6 +325,7 @@ def _files(agent: Agent) -> Files | None:
 def _alarms(agent: Agent) -> list[str]:
     alarms = [alarm for alarm in (agent.spool.alarm, agent.record.alarm) if alarm] + WATCH.alarms()
     alarms += agent.recorder.alarms() if agent.recorder is not None else []
+    alarms += [agent.no_recorder] if agent.no_recorder is not None else []
     alarms += [f"source failed: {source.description}" for source in agent.sources if source.failed]
     waits = [source.waits() for source in agent.sources]
     if agent.downlink is not None:

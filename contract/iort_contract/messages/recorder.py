@@ -80,8 +80,8 @@ class Trigger:
 
     @property
     def cooldown_us(self) -> int:
-        """How long further edges are ignored."""
-        return round(self.cooldown_s * _US)
+        """How long further edges are ignored: a second at least."""
+        return max(_US, round(self.cooldown_s * _US))
 
 
 @dataclass(frozen=True)

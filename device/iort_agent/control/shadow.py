@@ -115,14 +115,15 @@ class Recorder(Protocol):
     def want(self, wanted: Wanted) -> None: ...
 
 
-_NO_RECORDER = "the robot has no recorder: car.yaml has no section recorder"
+NO_RECORDER = "the robot has no recorder: car.yaml has no section recorder"
 
 
 class Shadow:
     """Follows the shadow and reports there. The ticker calls `tick`, the uplink all else. ``over_share`` is
     the cloud's last report of batches that it put off. ``in_force`` are the
     settings until the shadow is known, if not the file's. ``drive`` and ``moves`` are reported: what a stick
-    drives, and whether the robot has a motion that can be stopped."""
+    drives, and whether the robot has a motion that can be stopped. ``no_recorder`` is the answer to triggers
+    without a recorder."""
 
     def __init__(
         self,
@@ -136,8 +137,9 @@ class Shadow:
         drive: DriveLimits | None = None,
         moves: bool = False,
         recorder: Recorder | None = None,
+        no_recorder: str = NO_RECORDER,
     ) -> None:
-        self._recorder = recorder
+        self._recorder, self._no_recorder = recorder, no_recorder
         self._base, self.settings = base, in_force or base
         self._apply = apply
         self._known_fields = known_fields
@@ -307,7 +309,7 @@ class Shadow:
             name: rejection._replace(value=_quoted(rejection.value))
             for name, rejection in self._rejected.items()
         }
-        recorder = self._recorder
+        recorder, wanted = self._recorder, self._wanted.triggers
         return encode_reported(
             Reported(
                 self.settings.by_name(),
@@ -316,7 +318,7 @@ class Shadow:
                 self._agent_version,
                 self._drive,
                 self._moves,
-                dict.fromkeys(self._wanted.triggers, _NO_RECORDER) if recorder is None else recorder.answers,
+                recorder.answers if recorder is not None else dict.fromkeys(wanted, self._no_recorder),
             )
         )
 

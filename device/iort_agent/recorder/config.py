@@ -19,7 +19,8 @@ class RecorderConfig:
     older than ``max_age_s``, and takes at most ``max_disk_share`` of the disk. It gives way while less than
     ``keep_free_mb`` of the disk are free, or what the queue may still take. ``topics`` are the ROS topics and
     streams to keep, with ``*`` for any characters. ``memory_mb`` bounds what waits to be written. A power cut
-    loses at most the last ``sync_s``; a killed process, the last second. ``service`` and ``topic`` are the
+    loses at most the last ``sync_s``; a killed process, the last second. Incidents that wait for their upload
+    take ``max_mb`` more at most. ``service`` and ``topic`` are the
     ROS names by which a program on the robot triggers.
     """
 

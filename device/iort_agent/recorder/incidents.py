@@ -36,8 +36,6 @@ Tell = Callable[[str, int, Mapping[str, Value]], object]
 
 # The ring closes its chunks once a second, and messages may be late.
 SETTLE_US = 1_500_000
-# A trigger counts no more edges than this, whatever its cooldown.
-LEAST_COOLDOWN_US = 1_000_000
 # A batch that is open gets into the queue within a second.
 _TOLD_S = 2.0
 _RETRY_S, _MAX_RETRY_S, _FLUSH_S, _GIVE_UP_FLUSH_US = 2.0, 60.0, 2.0, 30_000_000
@@ -106,8 +104,7 @@ class Incidents:
         plan, name = self._plan, trigger.name
         with plan.lock:
             self.counts["edges"] += 1
-            cooldown_us = max(trigger.cooldown_us, LEAST_COOLDOWN_US)
-            if cools(plan.last_us.get(name), edge.t_us, cooldown_us):
+            if cools(plan.last_us.get(name), edge.t_us, trigger.cooldown_us):
                 self.counts["cooled"] += 1
                 return
             plan.last_us[name] = edge.t_us

@@ -97,11 +97,12 @@ class Recorder:
         self.on_answers: Callable[[], object] = lambda: None
         self.answers: Mapping[str, str] = self._triggers.answers()
         self._wanted: Wanted | None = None
-        # What is in the shadow, and was followed.
-        self._followed = Wanted()
+        # What is in the shadow, and was followed in this run.
+        self._followed: Wanted | None = None
         # Events that wait: which, and why.
         self._events: deque[tuple[str, str]] = deque(maxlen=64)
-        self._stopped = False
+        # None before the first settings: a stop that outlived the agent is none of now.
+        self._stopped: bool | None = None
         self._away = False
         self._stop, self._end = threading.Event(), threading.Event()
         self._threads = [Supervised("recorder", self._run), Supervised("incidents", self._run_incidents)]
@@ -151,7 +152,7 @@ class Recorder:
 
     def stopped(self, stopped: bool) -> None:  # noqa: FBT001 - a setting's value
         """Note whether the emergency stop is in force."""
-        if stopped and not self._stopped:
+        if stopped and self._stopped is False:
             self._events.append((STOP, "the emergency stop came into force"))
         self._stopped = stopped
 
@@ -214,8 +215,9 @@ class Recorder:
                 self.incidents.refuse(take_id, str(error))
 
     def _take_answers(self) -> dict[str, str]:
+        takes = self._followed.takes if self._followed is not None else {}
         with self._plan.lock:
-            return {name: self._plan.takes[name] for name in self._followed.takes if name in self._plan.takes}
+            return {name: self._plan.takes[name] for name in takes if name in self._plan.takes}
 
     def _look_at_connection(self) -> None:
         status = self._connection()

@@ -121,8 +121,9 @@ def test_events_fire(tmp_path: Path) -> None:
     graph.hear("/keep_topic", "std_msgs/String", string("near miss"))
     bench.step()
     bench.clock.advance(100)
-    bench.recorder.stopped(True)
-    bench.recorder.stopped(True)
+    for stopped in (True, False, True, True):
+        # The first one is from before this run.
+        bench.recorder.stopped(stopped)
     bench.step()
     bench.clock.advance(100)
     bench.connection = Connection(False, DISCONNECT_S + 1, 1)
@@ -137,6 +138,16 @@ def test_events_fire(tmp_path: Path) -> None:
     ]
     lost_us = bench.clock.now_us() - round((DISCONNECT_S + 1) * S)
     assert bench.told[-1].from_us == lost_us - 30 * S
+
+
+def test_a_trigger_that_was_removed_while_the_agent_was_away_is_gone(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "ring")
+    bench.want(Trigger("hardbrake", "speed > 1"))
+    bench.recorder.close()
+    bench = Bench(tmp_path / "ring")
+    assert bench.recorder.answers == {"hardbrake": ACCEPTED}
+    bench.want()
+    assert bench.recorder.answers == {}
 
 
 def test_an_agent_that_was_never_connected_has_lost_no_connection(tmp_path: Path) -> None:
@@ -158,12 +169,21 @@ def play(emit: Emit, stop: threading.Event) -> None:
 
 
 sent: list[bytes] = []
+RUNS: dict[Agent, tuple[Runtime, threading.Thread]] = {}
+
+
+def end(agent: Agent) -> list[bytes]:
+    """End a run; what it has sent."""
+    runtime, thread = RUNS.pop(agent)
+    runtime.stop()
+    thread.join()
+    return list(sent)
 
 
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[Callable[..., Agent]]:
     """Starts agents with a recorder, and ends them."""
-    runs: list[tuple[Runtime, threading.Thread]] = []
+    runs = RUNS
 
     def run(**settings: Any) -> Agent:
         sent.clear()
@@ -178,13 +198,12 @@ def running(tmp_path: Path) -> Iterator[Callable[..., Agent]]:
         runtime = Runtime(agent, stopped_s=0.0)
         thread = threading.Thread(target=lambda: runtime.run(drain_s=0))
         thread.start()
-        runs.append((runtime, thread))
+        runs[agent] = runtime, thread
         return agent
 
     yield run
-    for runtime, thread in runs:
-        runtime.stop()
-        thread.join()
+    for agent in [*runs]:
+        end(agent)
 
 
 def test_others_open_the_incident_of_a_running_agent(running: Callable[..., Agent], tmp_path: Path) -> None:
@@ -216,6 +235,38 @@ def test_others_open_the_incident_of_a_running_agent(running: Callable[..., Agen
     assert report.recorder is not None
     assert report.recorder["waiting"] == 1
     assert "recorder  " in render(report)
+
+
+def test_a_window_begins_in_the_run_before(running: Callable[..., Agent], tmp_path: Path) -> None:
+    first = running()
+    assert first.recorder is not None
+    first.recorder.want(Wanted({"hardbrake": {**BRAKE, "before_s": 60.0, "after_s": 0.1}}, {}))
+    folder = tmp_path / "ring" / "incidents"
+    until(lambda: len(sent) > 20, within_s=30.0)
+    before = end(first)
+    running()
+    until(lambda: list(folder.glob("*.mcap")), within_s=30.0)
+    (path,) = folder.glob("*.mcap")
+    with path.open("rb") as file:
+        mcap = reader.make_reader(file, validate_crcs=True)
+        messages = [message.data for _, _, message in mcap.iter_messages(topics=["/chatter"])]
+        (about,) = [one.metadata for one in mcap.iter_metadata() if one.name == "iort.incident"]
+    assert messages[: len(before)] == before
+    assert messages[len(before) :] == sent[: len(messages) - len(before)]
+    assert len(json.loads(about["runs"])) == 2
+    assert json.loads(about["pauses"])[0][2] == "restart"
+
+
+def test_the_recorder_costs_no_samples(
+    running: Callable[..., Agent], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "ring").write_text("in the way")
+    agent = running()
+    assert agent.recorder is None
+    (alarm,) = [alarm for alarm in make_status(agent).alarms if "recorder" in alarm]
+    assert alarm.startswith("the recorder does not work")
+    assert alarm in caplog.text
+    until(lambda: len(sent) > 5, within_s=30.0)
 
 
 def test_the_uploads_tell_the_recorder(running: Callable[..., Agent], tmp_path: Path) -> None:
