@@ -172,7 +172,7 @@ class Agent:
             replayed=self._replayed,
             reports=[
                 # With a number, because two sources may have the same description.
-                *((f"{i}: {source.description}", source.report) for i, source in enumerate(self.sources)),
+                *((f"{i}: {source.description}", source.account) for i, source in enumerate(self.sources)),
                 *([("contents", self.attachments.report)] if self.attachments is not None else []),
             ],
         )

@@ -24,8 +24,8 @@ _log = logging.getLogger(__name__)
 
 # A segment is closed after these bytes or this time, and then it may be deleted.
 SEGMENT_BYTES, SEGMENT_S = 8 * 1024 * 1024, 10.0
-# The last chunk may make it a little larger.
-_ROOM_BYTES = SEGMENT_BYTES + 2 * 1024 * 1024
+# What a segment takes at most, as the last chunk may make it a little larger.
+LEAST_BYTES = SEGMENT_BYTES + 2 * 1024 * 1024
 # Why the oldest segment was deleted.
 SIZE, AGE, SHARE, FULL = "max_mb", "max_age_s", "max_disk_share", "disk full"
 _NAME = re.compile(r"(\d{8,})-(\d+)\.mcap")
@@ -122,7 +122,7 @@ class RingFolder:
         since_us = now_us - round(self._config.max_age_s * 1e6)
         while self._segments and self._segments[0].to_us < since_us:
             self._evict_one(AGE)
-        reserve = self._reserve + (_ROOM_BYTES if stopped else 0)
+        reserve = self._reserve + (LEAST_BYTES if stopped else 0)
         while True:
             disk = os.statvfs(self.path)
             lacking = reserve - disk.f_bavail * disk.f_frsize
@@ -135,7 +135,7 @@ class RingFolder:
         share = round(config.max_disk_share * disk.f_blocks * disk.f_frsize)
         if share < allowed:
             allowed, why = share, SHARE
-        while self._bytes() > max(0, allowed - _ROOM_BYTES):
+        while self._bytes() > max(0, allowed - LEAST_BYTES):
             self._evict_one(why)
 
     def make_room(self) -> bool:

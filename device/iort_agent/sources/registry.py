@@ -99,3 +99,8 @@ class SourceRun:
     def report(self) -> Mapping[str, Any]:
         """The source's own counts."""
         return self.source.report()
+
+    def account(self) -> Mapping[str, Any]:
+        """The counts of what is recorded: a topic for the ring alone lacks nothing there."""
+        left_out = self.source.ring_topics if isinstance(self.source, RosSource) else ()
+        return {name: counts for name, counts in self.report().items() if name not in left_out}

@@ -163,6 +163,7 @@ class RosSource:
         self._taken: frozenset[str] = OWN_STREAMS
         # The streams that are not recorded; a pattern's come as its topics are found.
         self.only_ring = set(config.only_ring())
+        self.ring_topics: set[str] = set()
         # Whether somebody takes whole messages, whatever is selected of them.
         self.whole = False
 
@@ -250,6 +251,7 @@ class RosSource:
             # Nobody reads the fields.
             settings = replace(settings, fields=None, large=REFUSE)
             self.only_ring.add(settings.stream)
+            self.ring_topics.add(topic)
         intake = Intake(
             name,
             settings,

@@ -15,9 +15,11 @@ from typing import Iterator
 
 from iort_agent.common.state import Status
 from iort_agent.config import Config
-from iort_agent.errors import IdentityError, NotRunningError
+from iort_agent.errors import AgentError, IdentityError, NotRunningError
 from iort_agent.identity import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
+from iort_agent.recorder.folder import LEAST_BYTES
+from iort_agent.recorder.segment import require_mcap
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.sources.ros2 import Ros2Config, middleware
@@ -43,6 +45,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     for i, source in enumerate(config.sources):
         yield from source.check(f"source {i} ({source.describe()})")
     yield from _queue(config)
+    yield from _recorder(config)
     yield _lanes(config)
     yield emergency_stop(config)
     yield from rows(config, running)
@@ -116,6 +119,39 @@ def _queue(config: Config) -> Iterator[Finding]:
         yield Finding("queue", WARN, text, "the disk is full before the queue is: lower queue.max_bytes")
     else:
         yield Finding("queue", OK, text)
+
+
+def _recorder(config: Config) -> Iterator[Finding]:
+    recorder = config.recorder
+    if recorder is None:
+        return
+    assert recorder.folder is not None, "as the configuration is loaded"
+    try:
+        require_mcap()
+    except AgentError as error:
+        yield Finding("recorder", FAIL, str(error), "or take the section `recorder` out")
+        return
+    place = next(folder for folder in (recorder.folder, *recorder.folder.parents) if folder.is_dir())
+    if not os.access(place, os.W_OK):
+        yield Finding(
+            "recorder", FAIL, f"{place} may not be written", f"chown it to {os.environ.get('USER')}"
+        )
+        return
+    disk = shutil.disk_usage(place)
+    used = sum(path.stat().st_size for path in recorder.folder.glob("*.mcap"))
+    allowed = min(recorder.max_mb * 1e6, recorder.max_disk_share * disk.total)
+    room = disk.free + used - max(recorder.keep_free_mb * 1e6, config.queue.max_bytes)
+    text = (
+        f"{recorder.folder}, {used / 1e6:.0f} MB used of {allowed / 1e6:.0f}, {disk.free / 1e6:.0f} MB free"
+    )
+    if room < LEAST_BYTES:
+        yield Finding("recorder", FAIL, text, "free some of the disk: the ring keeps nothing")
+    elif room < allowed:
+        yield Finding(
+            "recorder", WARN, text, f"the disk has room for {room / 1e6:.0f} MB: lower recorder.max_mb"
+        )
+    else:
+        yield Finding("recorder", OK, text)
 
 
 def emergency_stop(config: Config) -> Finding:

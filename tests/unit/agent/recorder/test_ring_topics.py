@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,10 +15,12 @@ from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.recorder.config import RecorderConfig
 from iort_agent.recorder.ring import Ring
+from iort_agent.sources import FAIL, OK, WARN
 from iort_agent.sources.intake import Intake
 from iort_agent.sources.registry import SourceRun
 from iort_agent.sources.ros import RosSource
 from iort_agent.sources.ros1 import Ros1Config, TopicConfig
+from iort_agent.verbs.check import _recorder
 from iort_contract.catalog.streams import TYPES_STREAM
 from testkit.agent import ManualClock
 
@@ -108,7 +113,8 @@ def test_a_topic_for_the_ring_alone_is_heard_and_not_recorded(
     assert kept["/camera/image"].channel.stream == "camera-image"
     assert [(stream, values) for stream, values in recorded if stream != TYPES_STREAM] == [("imu", {"v": 2})]
     assert [values["stream"] for stream, values in recorded if stream == TYPES_STREAM] == ["imu", "none"]
-    assert set(run.source.report()) == {"/imu", "/speed", "/none", "/camera/image"}
+    assert set(run.report()) == {"/imu", "/speed", "/none", "/camera/image"}
+    assert set(run.account()) == {"/imu", "/none"}, "nobody misses the others in the record"
     ring.close()
 
 
@@ -145,3 +151,22 @@ def test_the_ring_is_beside_the_queue_unless_it_has_a_folder(tmp_path: Path) -> 
         config = load_config(file)
         assert config.recorder is not None
         assert config.recorder.folder == tmp_path / folder
+
+
+@pytest.mark.parametrize(
+    ("free_mb", "missing", "level"),
+    [(5000, False, OK), (1000, False, WARN), (260, False, FAIL), (5000, True, FAIL)],
+)
+def test_the_check_tells_whether_the_ring_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free_mb: int, *, missing: bool, level: str
+) -> None:
+    (tmp_path / "x").touch()
+    file = tmp_path / "car.yaml"
+    file.write_text(CAR.replace("TOPICS", "{/a: {time: arrival}}") + "recorder: {max_mb: 2000}\n")
+    disk = SimpleNamespace(total=20_000 * 10**6, free=free_mb * 10**6)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk)
+    if missing:
+        monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    (finding,) = _recorder(load_config(file))
+    assert finding.level == level
+    assert bool(finding.todo) == (level != OK)
