@@ -20,6 +20,7 @@ from typing import Any, Callable, Iterable, Mapping, NamedTuple
 
 from iort_contract import expression
 from iort_contract.catalog.derived import DERIVED, PARAMETERS, SOURCES, Vehicle, calculator
+from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.expression import FIELD, ExpressionError, MismatchError, Node, Reader
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.recorder import FAULT, MAX_SPAN_S, Trigger, check_limits
@@ -109,7 +110,9 @@ def check_trigger(trigger: Trigger) -> Trigger:
     """Return the trigger, if an agent may accept it; raises `ContractError`, or `ExpressionError` for its
     condition. Whether its streams have its fields is known only with samples."""
     check_limits(trigger)
-    evaluator_of(trigger)
+    evaluator = evaluator_of(trigger)
+    if evaluator is not None and (own := evaluator.streams & OWN_STREAMS):
+        raise ContractError(f"{min(own)} is the agent's own stream, which fires no trigger")
     return trigger
 
 

@@ -181,11 +181,11 @@ class Recorder:
                 self.step_slowly()
             self._clock.wait(self._stop, _STEP_S)
         # What has come until the sources ended.
-        self.step()
+        self.step(last=True)
 
-    def step(self) -> None:
-        """Evaluate what has come; the recorder's thread calls it."""
-        self._triggers.step()
+    def step(self, *, last: bool = False) -> None:
+        """Evaluate what has come; the recorder's thread calls it. ``last``: no samples come any more."""
+        self._triggers.step(last=last)
         while self._events:
             on, why = self._events.popleft()
             now_us = self._clock.now_us()

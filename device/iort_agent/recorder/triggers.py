@@ -23,13 +23,14 @@ from iort_agent.common.schema import did_you_mean
 from iort_agent.recorder.plan import Edge, Plan
 from iort_agent.sources import Emit
 from iort_contract.catalog.derived import DERIVED, SOURCES
-from iort_contract.catalog.streams import OWN_STREAMS, TYPES_STREAM
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.expression import ExpressionError, MismatchError
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.recorder import MAX_TRIGGERS, Trigger, decode_trigger
 from iort_contract.ros.message import RosMessage
 from iort_contract.topics import ACCEPTED
-from iort_contract.triggers import evaluator_of
+from iort_contract.triggers import Edge as TriggerEdge
+from iort_contract.triggers import check_trigger, evaluator_of
 
 _log = logging.getLogger(__name__)
 
@@ -72,8 +73,14 @@ class _Armed:
         self._busy_ns, self._since_us = 0, now_us
         self.busy_ns = self.samples = 0
 
-    def take(self, batch: list[_Heard], now_us: int, *, replayed: bool) -> list[tuple[Edge, int]]:
-        """Evaluate the samples; the edges, with their times in the ring. Raises what the evaluator does."""
+    def take(
+        self, batch: list[_Heard], now_us: int, *, played_us: int | None, last: bool
+    ) -> list[tuple[Edge, int]]:
+        """Evaluate the samples; the edges, with their times in the ring. Raises what the evaluator does.
+
+        ``played_us`` is the newest time in a recording that is played, None of what is heard now; ``last``:
+        no samples come any more.
+        """
         evaluator, found = self.evaluator, []
         if evaluator is None or self.problem:
             return []
@@ -87,9 +94,20 @@ class _Armed:
             if not i % _LOOK_AT_COST and time.thread_time_ns() - began > _MAX_AT_ONCE_NS:
                 break
         t_us, at_us = self._newest
-        if at_us and not replayed and (horizon := t_us + now_us - at_us - _LATE_US) > t_us:
-            for edge_us, values in evaluator.advance(horizon):
-                found.append((self._edge(edge_us, values), _ring_us(now_us - _LATE_US, horizon, edge_us)))
+        # The time that it is now, in the samples' time and in the ring's.
+        if not at_us:
+            horizon_us, horizon_at_us = 0, now_us
+        elif played_us is not None:
+            horizon_us, horizon_at_us = played_us, now_us
+        else:
+            horizon_us, horizon_at_us = t_us + now_us - at_us - _LATE_US, now_us - _LATE_US
+        late: tuple[TriggerEdge, ...] = ()
+        if horizon_us > t_us:
+            late = evaluator.advance(horizon_us)
+        else:
+            horizon_us, horizon_at_us = t_us, at_us
+        for edge_us, values in (*late, *(evaluator.finish() if last else ())):
+            found.append((self._edge(edge_us, values), _ring_us(horizon_at_us, horizon_us, edge_us)))
         self._measure(time.thread_time_ns() - began, now_us)
         return found
 
@@ -165,6 +183,8 @@ class Triggers:
         self._plan, self._now_us, self._on_edge, self._replayed = plan, now_us, on_edge, replayed
         self._inbox: deque[_Heard] = deque()
         self._bytes = 0
+        # The newest time of any stream.
+        self._newest_us = 0
         self._armed: dict[str, _Armed] = {}
         self._refused: dict[str, str] = {}
         # The streams that are evaluated.
@@ -193,6 +213,8 @@ class Triggers:
             if type(values) is RosMessage:
                 self._bytes += len(values.raw)
             self._inbox.append((stream, t_us, self._now_us(), values))
+        # After the inbox has it.
+        self._newest_us = max(self._newest_us, t_us)
 
     def desire(self, triggers: Mapping[str, Any]) -> None:
         """Put these in force instead of the others, also after a restart."""
@@ -204,15 +226,16 @@ class Triggers:
             self._plan.save()
         self._arm()
 
-    def step(self) -> None:
-        """Evaluate what has come."""
+    def step(self, *, last: bool = False) -> None:
+        """Evaluate what has come; ``last`` if no samples come any more."""
+        newest_us = self._newest_us
         batch = [self._inbox.popleft() for _ in range(len(self._inbox))]
         self._bytes = 0
         now_us = self._now_us()
         for armed in [*self._armed.values()]:
             try:
                 replayed = armed.evaluator is not None and any(map(self._replayed, armed.evaluator.streams))
-                edges = armed.take(batch, now_us, replayed=replayed)
+                edges = armed.take(batch, now_us, played_us=newest_us if replayed else None, last=last)
             except MismatchError as error:
                 armed.problem = str(error)
                 _log.error("recorder: trigger %s: %s", armed.trigger.name, error)
@@ -256,13 +279,11 @@ class Triggers:
         refused: dict[str, str] = {}
         for name, content in wanted.items():
             try:
-                trigger = decode_trigger(name, content)
+                trigger = check_trigger(decode_trigger(name, content))
                 if len(armed) >= MAX_TRIGGERS:
                     raise ContractError(f"at most {MAX_TRIGGERS} triggers")  # noqa: TRY301 - one way out
                 known = before.get(name)
                 one = known if known is not None and known.trigger == trigger else _Armed(trigger, now_us)
-                if one.evaluator is not None and (own := one.evaluator.streams & OWN_STREAMS):
-                    raise ContractError(f"{min(own)} is the agent's own stream, which fires no trigger")  # noqa: TRY301 - as above
                 armed[name] = one
             except (ContractError, ExpressionError) as error:  # noqa: PERF203 - each has its own answer
                 refused[name] = str(error).partition("\n")[0]

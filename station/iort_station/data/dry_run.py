@@ -8,6 +8,7 @@ from __future__ import annotations
 import heapq
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
@@ -17,6 +18,7 @@ from iort_analysis.archive.stored import Origin, PageProgress
 from iort_analysis.samples.batches import Item, RefusedItems
 from iort_analysis.samples.blocks import values
 from iort_contract.catalog.derived import SOURCES
+from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.expression import ExpressionError, MismatchError
 from iort_contract.limits import ContractError, Value
@@ -191,9 +193,9 @@ class _Read:
             yield row
 
     def newest_us(self) -> int | None:
-        """The time of the robot's newest sample of any stream in the range: until then, it was there."""
+        """The time of the newest sample in the range of any stream that may fire a trigger."""
         newest = None
-        for stream in inventory.streams_of(self._cloud, self._robot):
+        for stream in {*inventory.streams_of(self._cloud, self._robot)} - OWN_STREAMS:
             recorded = Recorded(self._cloud, self._robot, stream)
             last = recorded.before(self.end_us)
             for t_us in [] if last is None else recorded.block(last, lambda _name: False).times_us.tolist():
@@ -270,16 +272,14 @@ def _length_us(of: Sequence[Window]) -> int:
 
 
 def _within_budget(found: Sequence[Window], total: int, budget: float) -> int:
-    """The bytes that the budget of each day (UTC) lets through: a whole incident, or nothing of it."""
+    """The bytes that the budget of each day (UTC) lets through."""
     if not budget or not found:
         return total
-    spent: dict[int, float] = {}
+    days: Counter[int] = Counter()
     for window in found:
-        size = total * _length_us([window]) / max(1, _length_us(found))
-        day = window.to_us // _DAY_US
-        if spent.get(day, 0.0) + size <= budget:
-            spent[day] = spent.get(day, 0.0) + size
-    return round(sum(spent.values()))
+        days[window.to_us // _DAY_US] += window.to_us - window.from_us
+    rate = total / max(1, _length_us(found))
+    return round(sum(min(budget, length_us * rate) for length_us in days.values()))
 
 
 def lines(

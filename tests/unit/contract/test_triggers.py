@@ -220,6 +220,8 @@ def test_unknown_parameters_and_streams_are_refused() -> None:
         check_trigger(Trigger("fast", "speed > 2", others=("pose",)))
     with pytest.raises(ExpressionError):
         check_trigger(Trigger("fast", "speed > "))
+    with pytest.raises(ContractError, match="rtt is the agent's own stream, which fires no trigger"):
+        check_trigger(Trigger("slow", "broker_ms > 100", stream="rtt"))
     assert evaluator("x > 1 and pose.y > 1 and silent(scan, 1s)", others=("pose",)).streams == {
         "vesc", "pose", "scan",
     }  # fmt: skip
