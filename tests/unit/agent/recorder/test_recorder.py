@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -229,8 +230,9 @@ def test_others_open_the_incident_of_a_running_agent(running: Callable[..., Agen
     account = json.loads(about["iort.account"]["/chatter"])
     assert (account["messages"], account["missing"]) == (len(whole), 0)
     assert json.loads(about["iort.incident"]["agent"])["robot"] == "car1"
-    with highlevel.AnyReader([path]) as bag:
-        assert [data for _, _, data in bag.messages()] == whole
+    if sys.version_info >= (3, 10):  # the rosbags for older ones opens no single file
+        with highlevel.AnyReader([path]) as bag:
+            assert [data for _, _, data in bag.messages()] == whole
     report = make_status(agent)
     assert report.recorder is not None
     assert report.recorder["waiting"] == 1
