@@ -20,7 +20,7 @@ from iort_agent.common.threads import Clock
 from iort_agent.recorder import cut
 from iort_agent.recorder.account import Losses
 from iort_agent.recorder.config import RecorderConfig
-from iort_agent.recorder.plan import MAX_EDGES, OPEN, Edge, Incident, Plan, incident_id
+from iort_agent.recorder.plan import MAX_EDGES, OPEN, Edge, Incident, Plan
 from iort_contract.catalog.streams import INCIDENT_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages import recorder

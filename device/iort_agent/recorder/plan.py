@@ -13,7 +13,6 @@ A trigger that only tells makes an incident that is `notified` at once.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import threading
@@ -85,11 +84,6 @@ class Incident:
     def texts(self, name: str, between: str) -> str:
         """A text of all its edges, each once."""
         return between.join(dict.fromkeys(filter(None, (getattr(edge, name) for edge in self.edges))))
-
-
-def incident_id(robot: str, what: str, t_us: int) -> str:
-    """The id of an incident that begins with an edge: the same one after a restart."""
-    return hashlib.sha256(f"{robot}\0{what}\0{t_us}".encode()).hexdigest()[:16]
 
 
 class Plan:
