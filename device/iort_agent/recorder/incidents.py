@@ -25,7 +25,18 @@ from iort_contract.catalog.streams import INCIDENT_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages import recorder
 from iort_contract.messages.files import File, file_key
-from iort_contract.messages.recorder import KEPT, LOST, NOTIFIED, OVER_BUDGET, STATES, UPLOADED, Take, Trigger
+from iort_contract.messages.recorder import (
+    KEPT,
+    LOST,
+    NOTIFIED,
+    OVER_BUDGET,
+    STATES,
+    TAKE,
+    UPLOADED,
+    Take,
+    Trigger,
+    incident_id,
+)
 from iort_contract.topics import ACCEPTED
 from iort_contract.triggers import Window, cools, merge
 
@@ -202,7 +213,7 @@ class Incidents:
             incident = other
         else:
             incident.agent = dict(self._agent())
-            first = incident.edges[0].trigger or "take"
+            first = incident.edges[0].trigger or TAKE
             incident.file = f"{first}-{incident.id}.mcap" if incident.state == OPEN else ""
             plan.incidents[incident.id] = incident
             if incident.state != OPEN:
@@ -411,7 +422,7 @@ def _telling(incident: Incident) -> str:
 
 def _names(incident: Incident) -> str:
     """What fired it."""
-    return ",".join(dict.fromkeys(edge.trigger or "take" for edge in incident.edges))
+    return ",".join(dict.fromkeys(edge.trigger or TAKE for edge in incident.edges))
 
 
 def _values(incident: Incident) -> str:
