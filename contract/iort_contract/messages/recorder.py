@@ -232,6 +232,8 @@ def encode_answers(answers: Mapping[str, str]) -> dict[str, str]:
 def _named(kind: Callable[..., T], key: str, name: str, content: Any) -> T:
     if not isinstance(content, Mapping):
         raise ContractError(f"{shown(name)} must be an object, got {shown(content)}")
+    # A shadow that does not remove what is null has the default, too.
+    content = {entry: value for entry, value in content.items() if value is not None}
     known = {one.name for one in fields(kind)}  # type: ignore[arg-type]  # a dataclass
     unknown = sorted(str(entry) for entry in content if entry not in known)
     if unknown:

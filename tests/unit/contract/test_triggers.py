@@ -354,6 +354,12 @@ def test_a_trigger_of_another_form_is_refused(content: Any, told: str) -> None:
     assert told in str(raised.value)
 
 
+def test_what_is_null_in_the_shadow_is_as_if_it_were_not_there() -> None:
+    written = encode_trigger(Trigger("a", "x > 1"))["recorder"]["triggers"]["a"]
+    assert written["topics"] is None
+    assert decode_trigger("a", written) == Trigger("a", "x > 1")
+
+
 TAKE = Take("feedbeef", 5 * S, 65 * S, "anna", "it drifted", ("/camera/*",))
 
 
