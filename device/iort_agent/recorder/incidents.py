@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 import os
 import threading
-import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Callable, Mapping, Protocol
@@ -20,10 +19,9 @@ from iort_agent.common.threads import Clock
 from iort_agent.recorder import cut
 from iort_agent.recorder.account import Losses
 from iort_agent.recorder.config import RecorderConfig
-from iort_agent.recorder.plan import MAX_EDGES, OPEN, Edge, Incident, Plan
+from iort_agent.recorder.plan import OPEN, Edge, Incident, Plan
 from iort_contract.catalog.streams import INCIDENT_STREAM
 from iort_contract.limits import Value
-from iort_contract.messages import recorder
 from iort_contract.messages.files import File, file_key
 from iort_contract.messages.recorder import (
     KEPT,
@@ -38,7 +36,7 @@ from iort_contract.messages.recorder import (
     incident_id,
 )
 from iort_contract.topics import ACCEPTED
-from iort_contract.triggers import Window, cools, merge
+from iort_contract.triggers import cools
 
 _log = logging.getLogger(__name__)
 
@@ -91,8 +89,7 @@ class Incidents:
         self.folder = folder
         self._max_bytes = round(config.max_mb * 1e6)
         self._keep_free = round(config.keep_free_mb * 1e6 / 2)
-        # Wakes the thread that cuts; after a new file, the uploads.
-        self.wake = threading.Event()
+        # Called after a new file.
         self.on_file: Callable[[], object] = lambda: None
         # Id -> the state that was told, and when.
         self._told: dict[str, tuple[str, float]] = {}
@@ -107,7 +104,7 @@ class Incidents:
         """Tell what the run before may not have told."""
         with self._plan.lock:
             for incident in self._plan.incidents.values():
-                if incident.told != _telling(incident):
+                if incident.told != incident.telling:
                     self._say(incident)
 
     def fire(self, trigger: Trigger, edge: Edge, ring_us: int) -> None:
@@ -131,7 +128,7 @@ class Incidents:
             )
             if trigger.notify:
                 incident.state = NOTIFIED
-            elif (left := self._left(incident)) is not None and left <= 0:
+            elif (left := self._plan.left(incident, self._clock.now_us())) is not None and left <= 0:
                 incident.state = OVER_BUDGET
                 incident.why = f"{name} has spent its {trigger.budget_mb_day:g} MB of the day"
             self._add(incident)
@@ -142,7 +139,7 @@ class Incidents:
         with self._plan.lock:
             if take.id in self._plan.takes:
                 return
-            self._answer(take.id, ACCEPTED)
+            self._plan.answer(take.id, ACCEPTED)
             self._add(
                 Incident(
                     id=incident_id(self._robot, take.id, 0),
@@ -159,14 +156,8 @@ class Incidents:
         """Note a take that cannot be done."""
         with self._plan.lock:
             if take_id not in self._plan.takes:
-                self._answer(take_id, why)
+                self._plan.answer(take_id, why)
                 self._plan.save()
-
-    def _answer(self, take_id: str, answer: str) -> None:
-        takes = self._plan.takes
-        takes[take_id] = answer
-        while len(takes) > _TAKES:
-            del takes[next(iter(takes))]
 
     def step(self, stop: threading.Event) -> bool:
         """Cut the next incident that is due; False if none is. Also ends what has been told for certain."""
@@ -205,11 +196,12 @@ class Incidents:
         plan = self._plan
         if incident.id in plan.incidents:
             return
-        other = self._overlapping(incident) if incident.state == OPEN else None
+        other = plan.overlapping(incident) if incident.state == OPEN else None
         if other is None and len(plan.incidents) >= _MAX_INCIDENTS:
             incident.state, incident.why = LOST, f"{_MAX_INCIDENTS} incidents wait already"
         if other is not None:
-            self._merge(other, incident)
+            self.counts["merged"] += 1
+            other.merge(incident)
             incident = other
         else:
             incident.agent = dict(self._agent())
@@ -219,40 +211,8 @@ class Incidents:
             if incident.state != OPEN:
                 self.counts[incident.state] += 1
         plan.save()
-        _log.info("recorder: %s: incident %s, %s", _names(incident), incident.id, incident.state)
+        _log.info("recorder: %s: incident %s, %s", incident.names, incident.id, incident.state)
         self._say(incident)
-        self.wake.set()
-
-    def _overlapping(self, incident: Incident) -> Incident | None:
-        window = Window(incident.ring_from_us, incident.ring_to_us, ())
-        for other in self._plan.incidents.values():
-            if other.state == OPEN and not other.key and merge(_window(other), window) is not None:
-                return other
-        return None
-
-    def _merge(self, into: Incident, incident: Incident) -> None:
-        self.counts["merged"] += 1
-        into.from_us, into.to_us = min(into.from_us, incident.from_us), max(into.to_us, incident.to_us)
-        into.ring_from_us = min(into.ring_from_us, incident.ring_from_us)
-        into.ring_to_us = max(into.ring_to_us, incident.ring_to_us)
-        # No topics means all.
-        into.topics = sorted({*into.topics, *incident.topics}) if into.topics and incident.topics else []
-        if len(into.edges) < MAX_EDGES or incident.edges[0].trigger not in into.triggers:
-            into.edges += incident.edges
-        else:
-            into.more_edges += 1
-        # One without a limit of its own pays for all.
-        both = {**into.budgets, **incident.budgets}
-        into.budgets = both if into.budgets and incident.budgets else {}
-        into.told = ""
-
-    def _left(self, incident: Incident) -> int | None:
-        """The bytes that the trigger with the most left may still spend today; None without a limit."""
-        spent = self._plan.spent.get(self._day(), {})
-        return max((most - spent.get(name, 0) for name, most in incident.budgets.items()), default=None)
-
-    def _day(self) -> str:
-        return time.strftime("%Y-%m-%d", time.gmtime(self._clock.now_us() // 1_000_000))
 
     def _next(self) -> Incident | None:
         now_us, now = self._ring.now_us(), self._clock.monotonic()
@@ -274,7 +234,8 @@ class Incidents:
             # From here on none is.
             done = bool(incident.key) and path.exists()
             incident.key = incident.key or "cutting"
-            left, free = self._left(incident), self._max_bytes - self._waiting_bytes()
+            left = self._plan.left(incident, self._clock.now_us())
+            free = self._max_bytes - self._waiting_bytes()
         if not done:
             in_time = self._ring.now_us() < incident.ring_to_us + SETTLE_US + _GIVE_UP_FLUSH_US
             if not self._ring.flush(_FLUSH_S) and in_time:
@@ -303,9 +264,7 @@ class Incidents:
             with suppress(OSError):
                 _sync(self.folder)
         with self._plan.lock:
-            payer = self._payer(incident)
-            if payer:
-                self._plan.spend(self._day(), payer, incident.size)
+            self._plan.spend(incident, self._clock.now_us())
             self._held.pop(incident.id, None)
             self.alarm = None
             self._turn(incident, KEPT)
@@ -373,30 +332,10 @@ class Incidents:
     def _waiting_bytes(self) -> int:
         return sum(incident.size for incident in self._plan.incidents.values() if incident.state == KEPT)
 
-    def _payer(self, incident: Incident) -> str:
-        spent = self._plan.spent.get(self._day(), {})
-        return max(incident.budgets, key=lambda name: incident.budgets[name] - spent.get(name, 0), default="")
-
     def _say(self, incident: Incident) -> None:
         """Tell an incident's state as a sample."""
-        state = KEPT if incident.state == OPEN else incident.state
-        said = _values(incident), incident.texts("why", "; "), incident.why
-        sample = recorder.Incident(
-            id=incident.id,
-            trigger=_names(incident),
-            from_us=incident.from_us,
-            to_us=incident.to_us,
-            state=state,
-            condition=incident.edges[0].when[:_MAX_TEXT],
-            why="; ".join(filter(None, said))[:_MAX_TEXT],
-            by=incident.texts("by", ", ")[:_MAX_TEXT],
-            key=incident.key if incident.state == UPLOADED else "",
-            bytes=incident.size,
-            messages=incident.messages,
-            missing=incident.missing,
-        )
-        self._tell(INCIDENT_STREAM, self._clock.now_us(), sample.sample())
-        self._told[incident.id] = _telling(incident), self._clock.monotonic()
+        self._tell(INCIDENT_STREAM, self._clock.now_us(), incident.sample())
+        self._told[incident.id] = incident.telling, self._clock.monotonic()
 
     def _settle(self) -> None:
         """Note what the queue on disk has by now, and forget incidents that have ended."""
@@ -409,29 +348,10 @@ class Incidents:
                 if incident is None:
                     continue
                 incident.told = telling
-                if incident.state not in (OPEN, KEPT) and telling == _telling(incident):
+                if incident.state not in (OPEN, KEPT) and telling == incident.telling:
                     del self._plan.incidents[known]
             if settled:
                 self._plan.save()
-
-
-def _telling(incident: Incident) -> str:
-    """What a reader is told: the state, and the window as far as it has grown."""
-    return f"{incident.state} {incident.from_us} {incident.to_us} {len(incident.edges)}"
-
-
-def _names(incident: Incident) -> str:
-    """What fired it."""
-    return ",".join(dict.fromkeys(edge.trigger or TAKE for edge in incident.edges))
-
-
-def _values(incident: Incident) -> str:
-    """The values at the first edge."""
-    return ", ".join(f"{name}={value}" for name, value in incident.edges[0].values.items())
-
-
-def _window(incident: Incident) -> Window:
-    return Window(incident.ring_from_us, incident.ring_to_us, ())
 
 
 def _late(made: cut.Cut) -> str:

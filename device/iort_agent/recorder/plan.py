@@ -16,12 +16,16 @@ from __future__ import annotations
 import json
 import logging
 import threading
+import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePath
 from typing import Any, Mapping
 
 from iort_agent.common.private_files import open_below, write_below
 from iort_contract.limits import Value
+from iort_contract.messages import recorder
+from iort_contract.messages.recorder import KEPT, TAKE, UPLOADED
+from iort_contract.triggers import Window, merge
 
 _log = logging.getLogger(__name__)
 
@@ -34,6 +38,7 @@ _MAX_BYTES = 8_000_000
 MAX_EDGES = 32
 # The budget of a day that has just ended may still be asked for: the clock may be set back.
 _DAYS = 2
+_TAKES, _MAX_TEXT = 32, 1000
 
 
 @dataclass
@@ -81,9 +86,57 @@ class Incident:
         """The names of its triggers, the first one first."""
         return list(dict.fromkeys(edge.trigger for edge in self.edges if edge.trigger))
 
+    @property
+    def names(self) -> str:
+        """What fired it, for a person."""
+        return ",".join(dict.fromkeys(edge.trigger or TAKE for edge in self.edges))
+
+    @property
+    def window(self) -> Window:
+        """The window in the ring's time."""
+        return Window(self.ring_from_us, self.ring_to_us, ())
+
+    @property
+    def telling(self) -> str:
+        """What a reader is told: the state, and the window as far as it has grown."""
+        return f"{self.state} {self.from_us} {self.to_us} {len(self.edges)}"
+
     def texts(self, name: str, between: str) -> str:
         """A text of all its edges, each once."""
         return between.join(dict.fromkeys(filter(None, (getattr(edge, name) for edge in self.edges))))
+
+    def merge(self, other: Incident) -> None:
+        """Take another incident's edge and window into this one."""
+        self.from_us, self.to_us = min(self.from_us, other.from_us), max(self.to_us, other.to_us)
+        self.ring_from_us = min(self.ring_from_us, other.ring_from_us)
+        self.ring_to_us = max(self.ring_to_us, other.ring_to_us)
+        # No topics means all.
+        self.topics = sorted({*self.topics, *other.topics}) if self.topics and other.topics else []
+        if len(self.edges) < MAX_EDGES or other.edges[0].trigger not in self.triggers:
+            self.edges += other.edges
+        else:
+            self.more_edges += 1
+        # One without a limit of its own pays for all.
+        self.budgets = {**self.budgets, **other.budgets} if self.budgets and other.budgets else {}
+
+    def sample(self) -> dict[str, Value]:
+        """The incident as a sample for the readers."""
+        first = self.edges[0]
+        values = ", ".join(f"{name}={value}" for name, value in first.values.items())
+        return recorder.Incident(
+            id=self.id,
+            trigger=self.names,
+            from_us=self.from_us,
+            to_us=self.to_us,
+            state=KEPT if self.state == OPEN else self.state,
+            condition=first.when[:_MAX_TEXT],
+            why="; ".join(filter(None, (values, self.texts("why", "; "), self.why)))[:_MAX_TEXT],
+            by=self.texts("by", ", ")[:_MAX_TEXT],
+            key=self.key if self.state == UPLOADED else "",
+            bytes=self.size,
+            messages=self.messages,
+            missing=self.missing,
+        ).sample()
 
 
 class Plan:
@@ -128,11 +181,33 @@ class Plan:
         if self._changed:
             self.save()
 
-    def spend(self, day: str, trigger: str, size: int) -> None:
-        """Note the bytes of an incident."""
-        of_day = self.spent.pop(day, {})
-        of_day[trigger] = of_day.get(trigger, 0) + size
-        self.spent[day] = of_day
+    def answer(self, take_id: str, answer: str) -> None:
+        """Note what became of a take."""
+        self.takes[take_id] = answer
+        while len(self.takes) > _TAKES:
+            del self.takes[next(iter(self.takes))]
+
+    def overlapping(self, incident: Incident) -> Incident | None:
+        """An incident that is not cut yet, and whose window overlaps."""
+        for other in self.incidents.values():
+            if other.state == OPEN and not other.key and merge(other.window, incident.window) is not None:
+                return other
+        return None
+
+    def left(self, incident: Incident, now_us: int) -> int | None:
+        """The bytes that the trigger with the most left may still spend today; None without a limit."""
+        spent = self.spent.get(_day(now_us), {})
+        return max((most - spent.get(name, 0) for name, most in incident.budgets.items()), default=None)
+
+    def spend(self, incident: Incident, now_us: int) -> None:
+        """Note the bytes of an incident for the trigger with the most left."""
+        if not incident.budgets:
+            return
+        day = _day(now_us)
+        spent = self.spent.pop(day, {})
+        payer = max(incident.budgets, key=lambda name: incident.budgets[name] - spent.get(name, 0))
+        spent[payer] = spent.get(payer, 0) + incident.size
+        self.spent[day] = spent
         while len(self.spent) > _DAYS:
             del self.spent[next(iter(self.spent))]
 
@@ -153,3 +228,7 @@ class Plan:
             _log.error("%s", self.alarm)
             return
         self.incidents = {incident.id: incident for incident in incidents}
+
+
+def _day(now_us: int) -> str:
+    return time.strftime("%Y-%m-%d", time.gmtime(now_us // 1_000_000))

@@ -138,7 +138,6 @@ class Recorder:
     def close(self) -> None:
         """Take what has come, and end. What is open is cut by the next run."""
         self._stop.set()
-        self.incidents.wake.set()
         for thread in self._threads:
             if thread.is_alive():
                 thread.join()
