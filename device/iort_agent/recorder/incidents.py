@@ -48,11 +48,9 @@ SETTLE_US = 1_500_000
 # A batch that is open gets into the queue within a second.
 _TOLD_S = 2.0
 _RETRY_S, _MAX_RETRY_S, _FLUSH_S, _GIVE_UP_FLUSH_US = 2.0, 60.0, 2.0, 30_000_000
-_MAX_TEXT = 1000
 # What waits to be cut or uploaded; each is small in the plan, and the files are bounded in bytes.
 _MAX_INCIDENTS = 200
 _PAUSE_S = 0.002
-_TAKES = 32
 
 
 class Ring(cut.Source, Protocol):
