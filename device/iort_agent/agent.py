@@ -218,7 +218,7 @@ class Agent:
                 reserve=config.queue.max_bytes,
                 tell=lambda stream, t_us, values: self.streams.emit(stream, t_us, values, urgent=True),
                 connection=self.uplink.status,
-                reports=[source.report for source in self.sources],
+                reports=[(source.description, source.report) for source in self.sources],
                 replayed=self._replayed,
                 agent=self._state,
                 graph=graph,

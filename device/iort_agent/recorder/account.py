@@ -7,32 +7,36 @@ once a second, and remembered for as long as a window may be."""
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Callable, Mapping, Sequence, Tuple
 
 from iort_agent.recorder.ring import EVERY, Drop, RingMessage
 from iort_contract.messages.account import LOST
 
 # The looks that are remembered: one a second, of which only those with news count.
 _LOOKS = 4096
+# A source's name, and what returns its counts.
+Reports = Sequence[Tuple[str, Callable[[], Mapping[str, Any]]]]
 # Topic -> cause -> messages.
 Counted = Mapping[str, Mapping[str, int]]
 
 
 class Losses:
-    """What the sources say that they have lost, over the ring's time. ``since_us`` is when this began: what
-    was lost before is known to nobody."""
+    """What the sources say that they have lost, over the ring's time: by topic, or else by the source's name.
+    ``since_us`` is when this began: what was lost before is known to nobody."""
 
-    def __init__(self, reports: Sequence[Callable[[], Mapping[str, Any]]], now_us: int) -> None:
+    def __init__(self, reports: Reports, now_us: int) -> None:
         self._reports, self.since_us = reports, now_us
         self._looks: deque[tuple[int, Counted]] = deque([(now_us, {})], maxlen=_LOOKS)
 
     def look(self, now_us: int) -> None:
         """Note the counts, if they have changed; called about once a second."""
         counted: dict[str, Mapping[str, int]] = {}
-        for report in self._reports:
-            for topic, counts in dict(report()).items():
-                if isinstance(counts, Mapping) and (lost := _lost(counts)):
-                    counted[topic] = lost
+        for source, report in self._reports:
+            told = dict(report())
+            topics = {name: counts for name, counts in told.items() if isinstance(counts, Mapping)}
+            others = {name: count for name, count in told.items() if name not in topics}
+            lost = {name: _lost(counts) for name, counts in (*topics.items(), (source, others))}
+            counted.update({name: counts for name, counts in lost.items() if counts})
         if counted != self._looks[-1][1]:
             self._looks.append((now_us, counted))
 

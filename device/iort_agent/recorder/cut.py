@@ -18,7 +18,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, Callable, Iterator, Mapping, NamedTuple, Protocol, Sequence
 
-from iort_agent.recorder.account import Account, Counted
+from iort_agent.recorder.account import Account, Losses
 from iort_agent.recorder.config import NONE, ZSTD
 from iort_agent.recorder.ledger import fits
 from iort_agent.recorder.plan import Incident
@@ -118,7 +118,7 @@ def cut(
     *,
     compression: str,
     limit: int | None,
-    losses: Counted,
+    losses: Losses,
     pause: Callable[[], object],
     has_room: Callable[[], object],
 ) -> Cut:
@@ -141,9 +141,10 @@ def cut(
             if not i % _ROOM_EVERY:
                 has_room()
         drops = ring.drops(incident.ring_from_us, incident.ring_to_us)
-        topics = account.close(drops, losses, partial(fits, incident.topics or ["*"]))
+        lost = losses.between(incident.ring_from_us, incident.ring_to_us)
+        topics = account.close(drops, lost, partial(fits, incident.topics or ["*"]))
         account.late_us = max(0, ring.since_us() - incident.ring_from_us)
-        writer.add_metadata(INCIDENT, _about(incident, account))
+        writer.add_metadata(INCIDENT, _about(incident, account, losses))
         writer.add_metadata(ACCOUNT, {topic: json.dumps(counts) for topic, counts in topics.items()})
         writer.finish()
         file.flush()
@@ -175,7 +176,7 @@ def _copied(ring: Source, incident: Incident, writer: Any, account: Account) -> 
         yield
 
 
-def _about(incident: Incident, account: Account) -> Mapping[str, str]:
+def _about(incident: Incident, account: Account, losses: Losses) -> Mapping[str, str]:
     first = incident.edges[0]
     return {
         "id": incident.id,
@@ -196,6 +197,8 @@ def _about(incident: Incident, account: Account) -> Mapping[str, str]:
         "missing": str(account.missing),
         # Before this the ring has nothing any more, or was not there yet.
         "begins_late_s": f"{account.late_us / 1e6:.3f}",
+        # What the middleware lost before this agent began is not known.
+        "losses_since_us": str(losses.since_us),
         # Each run of the agent: from its first message in the window to its last.
         "runs": json.dumps(account.runs),
         "pauses": json.dumps(account.pauses),

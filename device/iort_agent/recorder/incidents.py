@@ -246,7 +246,7 @@ class Incidents:
                     path,
                     compression=self._config.compression,
                     limit=limit,
-                    losses=self._losses.between(incident.ring_from_us, incident.ring_to_us),
+                    losses=self._losses,
                     pause=lambda: self._pause(stop),
                     has_room=self._check_room,
                 )
@@ -292,10 +292,11 @@ class Incidents:
         with self._plan.lock:
             incident.why, incident.file, incident.key = why, "", ""
             self._held.pop(incident.id, None)
-            self.alarm = None
+            # Until the next one is kept.
+            self.alarm = f"recorder: incident {incident.id} is lost: {why}" if state == LOST else None
             self._turn(incident, state)
-        if state == LOST:
-            _log.error("recorder: incident %s is lost: %s", incident.id, why)
+        if self.alarm is not None:
+            _log.error("%s", self.alarm)
 
     def _turn(self, incident: Incident, state: str) -> None:
         """Change the state: in the plan, and then for the readers."""

@@ -19,13 +19,13 @@ import struct
 import threading
 from collections import deque
 from pathlib import Path
-from typing import Any, Callable, Container, Mapping, Sequence
+from typing import Any, Callable, Container, Mapping
 
 from iort_agent.common.state import Connection
 from iort_agent.common.threads import Clock, Supervised
 from iort_agent.errors import AgentError
 from iort_agent.files.folder import Folder
-from iort_agent.recorder.account import Losses
+from iort_agent.recorder.account import Losses, Reports
 from iort_agent.recorder.config import RecorderConfig
 from iort_agent.recorder.incidents import Incidents, Tell
 from iort_agent.recorder.plan import Edge, Plan
@@ -69,7 +69,7 @@ class Recorder:
         reserve: int,
         tell: Tell,
         connection: Callable[[], Connection],
-        reports: Sequence[Callable[[], Mapping[str, Any]]] = (),
+        reports: Reports = (),
         replayed: Callable[[str], bool] = lambda _: False,
         agent: Callable[[], Mapping[str, Any]] = dict,
         graph: Graph | None = None,

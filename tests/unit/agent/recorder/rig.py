@@ -95,7 +95,7 @@ class Rig:
         self.files = self.folder / "incidents"
         self.files.mkdir(parents=True, exist_ok=True)
         self.plan = Plan(self.folder)
-        self.losses = Losses([self.report], self.ring.now_us())
+        self.losses = Losses([("source", self.report)], self.ring.now_us())
         self.incidents = Incidents(
             "car1",
             config,

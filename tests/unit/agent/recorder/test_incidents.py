@@ -226,10 +226,10 @@ def test_the_clock_may_be_set_back_within_the_window(tmp_path: Path) -> None:
 
 
 def test_what_is_missing_is_told_with_the_reason(tmp_path: Path) -> None:
-    lost = {"/scan": {"messages": 5, "lost_by_middleware": 0}}
+    lost: dict[str, Any] = {"/scan": {"messages": 5, "lost_by_middleware": 0}, "bad_crc": 3}
     rig = Rig(tmp_path, triggers={"hardbrake": BRAKE}, report=lambda: lost)
-    rig.pass_s(10)
     rig.losses.look(rig.ring.now_us())
+    rig.pass_s(10)
     now_us = rig.ring.now_us()
     rig.ring.dropped.append(Drop("vesc", "/vesc", now_us, now_us, 3, "memory"))
     # Two more are gone, and nobody knows why.
@@ -238,6 +238,7 @@ def test_what_is_missing_is_told_with_the_reason(tmp_path: Path) -> None:
     rig.brake()
     rig.clock.advance(1)
     lost["/scan"]["lost_by_middleware"] = 7
+    lost["bad_crc"] = 4
     rig.losses.look(rig.ring.now_us())
     rig.pass_s(8)
     rig.cut()
@@ -251,7 +252,8 @@ def test_what_is_missing_is_told_with_the_reason(tmp_path: Path) -> None:
         "missing": 7,
         "why": {"lost_by_middleware": 7},
     }
-    assert rig.told[-1].missing == 12
+    assert account["source"]["why"] == {"bad_crc": 1}
+    assert rig.told[-1].missing == 13
 
 
 def test_an_evicted_begin_is_told_and_a_window_without_messages_is_lost(tmp_path: Path) -> None:
@@ -308,6 +310,7 @@ def test_a_full_disk_until_the_ring_has_nothing_more_loses_it_aloud(
     rig.cut()
     assert rig.states() == [KEPT, LOST]
     assert "is lost" in caplog.text
+    assert "is lost" in str(rig.incidents.alarm)
 
 
 def test_a_plan_that_cannot_be_written_is_an_alarm_and_written_later(
