@@ -60,7 +60,8 @@ class RingFolder:
         self.path, self._config = folder, config
         self._reserve = max(round(config.keep_free_mb * 1e6), reserve)
         self._lock = threading.Lock()
-        self.evicted_why = ""
+        # Up to when, in the ring's time, and why.
+        self.evicted_us, self.evicted_why = 0, ""
         self._synced = True
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -150,7 +151,7 @@ class RingFolder:
             if not self._segments:
                 return False
             _delete(self._segments[0].path)
-            del self._segments[0]
+            self.evicted_us = max(self.evicted_us, self._segments.pop(0).to_us)
         self.evicted_why = why
         return True
 

@@ -173,7 +173,7 @@ class Ring:
     def since_us(self) -> int:
         """The earliest time that the ring still has: what was before is evicted, or was before the ring."""
         segments = self._folder.segments()
-        return segments[0].from_us if segments else self._began_us
+        return segments[0].from_us if segments else max(self._began_us, self._folder.evicted_us)
 
     @property
     def evicted_why(self) -> str:

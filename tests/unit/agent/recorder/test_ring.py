@@ -336,6 +336,7 @@ def test_the_ring_gives_way_first_when_the_disk_is_full(
     assert desk.read() == []
     assert list(tmp_path.glob("*.mcap")) == []
     assert desk.ring.counts()["imu"].dropped == {DISK: 5}
+    assert desk.ring.since_us() >= T0 + 29 * S, "what was before is gone"
     disk.f_bavail = 10**12
     desk.pass_s(1)
     desk.imu(35, 1)
