@@ -1,4 +1,5 @@
-"""Present: keeps a robot's findings of a run in their table, and mails the serious ones.
+"""Present: keeps a robot's findings of a run in their table, mails the serious ones, and has the robot keep
+what its ring has of their times, if it has a trigger on findings.
 
 The state machine also calls it for what failed, a drive or a robot's step, which becomes a finding too.
 """
@@ -11,6 +12,8 @@ from typing import Any
 from functions.shared import clients
 from functions.shared.analysis import Kept, failure
 from functions.shared.clients import variables
+from functions.shared.metrics import emit
+from functions.shared.takes import Takes
 from iort_contract.catalog.analysis import KINDS, SERIOUS
 from iort_contract.catalog.environments import PresentEnvironment
 from iort_contract.cloud import drive_prefix, findings_key
@@ -19,20 +22,28 @@ from iort_contract.messages.analysis import DriveKey, Finding, decode_finding
 from iort_contract.page import history_link
 
 Notify = Callable[[str, str], None]
+# Has a robot keep the times of new findings; returns how many.
+Take = Callable[[str, Sequence[Finding]], int]
 
 
 def present(
-    drives: Iterable[tuple[DriveKey, Sequence[Finding]]], table: FindingsTable, notify: Notify, page_url: str
+    drives: Iterable[tuple[DriveKey, Sequence[Finding]]],
+    table: FindingsTable,
+    notify: Notify,
+    page_url: str,
+    take: Take = lambda _robot, _new: 0,
 ) -> dict[str, int]:
-    """Replace the findings of each drive; mail the serious ones that are new.
+    """Replace the findings of each drive; mail the serious ones that are new, and ``take`` all new ones.
 
     A robot's findings of one kind are one mail, about the first: a run may be of a year's drives.
     """
-    kept, mailed = 0, set[tuple[str, str]]()
+    kept, mailed, new = 0, set[tuple[str, str]](), dict[str, list[Finding]]()
     for drive, found in drives:
         before = {one.id: one for one in table.of_drive(drive)}
         for finding in found:
             about = (drive.robot, finding.kind)
+            if finding.id not in before:
+                new.setdefault(drive.robot, []).append(finding)
             if finding.severity == SERIOUS and finding.id not in before and about not in mailed:
                 notify(*mail(finding, page_url))
                 mailed.add(about)
@@ -41,6 +52,7 @@ def present(
             kept += 1
         for gone in before.keys() - {one.id for one in found}:
             table.remove(before[gone])
+    emit("present", FindingTakes=sum(take(robot, some) for robot, some in new.items()))
     return {"findings": kept, "mails": len(mailed)}
 
 
@@ -90,4 +102,4 @@ def handler(event: Mapping[str, Any], _context: object) -> dict[str, int]:
         (DriveKey(**one["drive"]), [decode_finding(finding) for finding in one["findings"]])
         for one in content["drives"]
     )
-    return present(drives, table, _notify, given.page_url)
+    return present(drives, table, _notify, given.page_url, Takes(clients.iot_data()).ask)

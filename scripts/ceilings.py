@@ -12,6 +12,8 @@ from aws_cdk import App
 
 from app import build
 from functions.alert import QUIET_S
+from functions.incident import MAILS_AN_HOUR
+from functions.shared.incidents import A_SECOND
 from iort_contract.catalog.questions import QUESTIONS
 from iort_station.cost.prices import MONTH_DAYS, PRICES
 from stacks.settings import A_ROBOTS_MOST, CONNECTION_MESSAGES_S, Settings
@@ -101,6 +103,15 @@ def robot(templates: Templates) -> Iterator[Ceiling]:
     yield Ceiling("questions, by a robot", limit, "the catalogue's quotas; `Answer`: `Timeout`", usd)
     held_by = "`Alert`: one in 15 minutes a cause"
     yield Ceiling("mails, by a robot and cause", f"{_DAY_S // QUIET_S} a day", held_by, None)
+    held_by = f"`Incident`: {MAILS_AN_HOUR} an hour"
+    yield Ceiling("mails of incidents, by a robot", f"{24 * MAILS_AN_HOUR} a day", held_by, None)
+    # Each is tried three times, and takes all of its time.
+    called = templates.one("Lambda::Function", "Incident")
+    gb_s = A_SECOND * 3 * called["Timeout"] * called["MemorySize"] / 1024
+    limit = f"{A_SECOND * _DAY_S:,.0f} a day, each of three calls of at most {called['Timeout']} s"
+    yield Ceiling(
+        "incidents told, by a robot", limit, "`Summarize`: 0.1 a second", _a_day("compute_arm", gb_s)
+    )
     gb = int(_variable(templates, "Summarize", "RECORD_BYTES_A_DAY")) / 1e9
     held_by = "`Summarize`: `RECORD_BYTES_A_DAY`; alarm `RobotsOverVolume`"
     usd = gb * 1e9 / 1024 * PRICES["write"].each

@@ -160,6 +160,7 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         },
         "analysis/PresentRole/DefaultPolicy": {
             wide(f"{files}/analysis/robot=*"): "it removes the results of drives that others replace",
+            wide(f"{iot}:thing/*/{SHADOW}"): f"{a_robot}; only this one of its shadows",
             **a_run,
         },
         "analysis/MachineRole/DefaultPolicy": {

@@ -24,6 +24,7 @@ from iort_contract.catalog.environments import (
     PresentEnvironment,
 )
 from iort_contract.cloud import ANALYSIS_PREFIX, PLANS_PREFIX
+from iort_contract.topics import SHADOW
 from stacks.parts import PlatformStack, allow, arrays, function, service_role
 from stacks.settings import Settings
 from stacks.states import LONGEST_S, states
@@ -89,6 +90,9 @@ class Analysis(PlatformStack):
         allow(present, ["s3:ListBucket"], self._storage.files.bucket_arn)
         allow(present, ["s3:DeleteObject"], self._objects(f"{ANALYSIS_PREFIX}robot="))
         allow(present, ["sns:Publish"], self._alarms.topic_arn)
+        # A robot with a trigger on findings is to keep what its ring has of the evidence.
+        shadow = self.format_arn(service="iot", resource="thing", resource_name=f"*/{SHADOW}")
+        allow(present, ["iot:GetThingShadow", "iot:UpdateThingShadow"], shadow)
         return present
 
     def _computing(self, name: str, environment: Environment, timeout_s: int) -> lambda_.Function:

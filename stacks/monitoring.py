@@ -127,7 +127,7 @@ class Alarms(Construct):
 # The functions and tables that every sample passes; without PubNub there is no Live.
 _FUNCTIONS_OF_SAMPLES, _TABLES_OF_SAMPLES = ("Live", "Summarize"), ("Batches", "Summary")
 # Nobody waits for these, and fifty metrics are free.
-_IN_THE_BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present"}
+_IN_THE_BACKGROUND = {"Incident", "Plan", "Analyse", "Evaluate", "Present"}
 
 
 class Dashboards(Construct):

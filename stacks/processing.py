@@ -1,5 +1,5 @@
-"""The functions that compute: live, summarize, later, echo, upload, query, alert and answer, each with its
-own role and log."""
+"""The functions that compute: live, summarize, later, echo, upload, query, alert, incident and answer, each
+with its own role and log."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from iort_contract.catalog.environments import (
     E,
     EchoEnvironment,
     Environment,
+    IncidentEnvironment,
     LaterEnvironment,
     LiveEnvironment,
     QueryEnvironment,
@@ -37,18 +38,22 @@ from iort_contract.tables import (
     ASKED_PREFIX,
     FILES_BYTES,
     FILES_DAY,
+    INCIDENT_PREFIX,
     RECORD_BYTES,
     RECORD_DAY,
     STREAMS,
     TOPIC,
 )
 from iort_contract.topics import ANSWER, FILE, LAMBDA, PONG, SHADOW
+from iort_contract.webhook import webhook_parameter
 from stacks.parts import RUNTIME, PlatformStack, allow, arrays, function, invoked_by_rule, queue
 from stacks.quarantine import Quarantine
 from stacks.settings import LEAST_OF_A_QUEUE, Settings
 from stacks.storage import Storage
 
 _SUMMARIZE_S = 60
+# Three tries of a webhook, each with its timeouts, and what AWS takes.
+_INCIDENT_S = 90
 
 
 class Processing(PlatformStack):
@@ -69,6 +74,8 @@ class Processing(PlatformStack):
     ) -> None:
         super().__init__(app, "processing", settings, storage.encryption)
         self._storage, self._rejected = storage, quarantine.rejected
+        self.alarms = self._alarms()
+        self._incident = self._incidents()
         live = {"live": self._live()} if settings.has_live else {}
         # The keys of waiting batches, whose robot is over its share.
         put_off = queue(self, "PutOff", reader_timeout_s=_SUMMARIZE_S, failures=self._rejected)
@@ -76,7 +83,6 @@ class Processing(PlatformStack):
         self._later(put_off)
         echo, upload = self._echo(), self._upload()
         self._query()
-        self.alarms = self._alarms()
         self.called = {**called, **live, "echo": echo, "upload": upload, "alert": self._alert()}
         self.called["answer"] = self._answer()
         for rule in settings.rules:
@@ -104,8 +110,7 @@ class Processing(PlatformStack):
             reserved_concurrency=self.settings.reserved_for_live,
         )
         invoked_by_rule(live, self._rejected)
-        parameter = self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/"))
-        allow(live, ["ssm:GetParameter"], parameter)
+        allow(live, ["ssm:GetParameter"], self._parameter(name))
         # Its rule imports it only with PubNub, and CloudFormation removes no export before its import.
         self.export_value(live.function_arn)
         return live
@@ -114,6 +119,7 @@ class Processing(PlatformStack):
         environment = self._environment(
             SummarizeEnvironment,
             put_off_queue=put_off.queue_url,
+            incident_function=self._incident.function_name,
             record_bytes_a_day=self.settings.record_gb_a_day * 10**9,
         )
         summarize = self._summarizing("Summarize", environment, RECORD_DAY, RECORD_BYTES)
@@ -147,7 +153,8 @@ class Processing(PlatformStack):
     def _later(self, put_off: sqs.Queue) -> None:
         # On the embedded cloud all functions share this machine's cores.
         alone = 1 if self.settings.embedded else 0
-        later = self._summarizing("Later", self._environment(LaterEnvironment), reserved_concurrency=alone)
+        environment = self._environment(LaterEnvironment, incident_function=self._incident.function_name)
+        later = self._summarizing("Later", environment, reserved_concurrency=alone)
         self._storage.telemetry.grant(later, "dynamodb:GetItem")
         self._rejected.grant_send_messages(later)
         put_off.grant_consume_messages(later)
@@ -183,6 +190,8 @@ class Processing(PlatformStack):
         self._storage.summary.grant(made, "dynamodb:BatchWriteItem")
         self._storage.robots.grant(made, "dynamodb:GetItem")
         self._storage.may_keep(made, STREAMS, *keeps)
+        # Not by the CDK's grant, which has every version of the function, too.
+        allow(made, ["lambda:InvokeFunction"], self._incident.function_arn)
         if self.settings.archive:
             self._storage.may_change(self._storage.archive, made, TOPIC, HOUR, DUE_MS, FIRST_DUE_MS)
         return made
@@ -225,6 +234,23 @@ class Processing(PlatformStack):
         # The car repeats the message within 10 s.
         invoked_by_rule(alert, self._rejected, age=Duration.minutes(5), retries=1)
         return alert
+
+    def _incidents(self) -> lambda_.Function:
+        name = webhook_parameter(self.settings.namespace)
+        environment = self._environment(
+            IncidentEnvironment, alarm_topic=self.alarms.topic_arn, webhook_parameter=name
+        )
+        incident = function(self, "Incident", environment, timeout_s=_INCIDENT_S)
+        self._storage.robots.grant(incident, "dynamodb:GetItem")
+        self._storage.may_keep(incident, f"{INCIDENT_PREFIX}*")
+        allow(incident, ["sns:Publish"], self.alarms.topic_arn)
+        allow(incident, ["ssm:GetParameter"], self._parameter(name))
+        # Lambda waits a minute before its second attempt, and two before its third.
+        invoked_by_rule(incident, self._rejected, age=Duration.minutes(30), retries=2)
+        return incident
+
+    def _parameter(self, name: str) -> str:
+        return str(self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/")))
 
     def _echo(self) -> lambda_.Function:
         echo = function(self, "Echo", self._environment(EchoEnvironment))

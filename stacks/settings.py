@@ -173,6 +173,11 @@ class Settings(BaseModel):
         description="receives alarms, alerts and the budget's mails; AWS asks this address for its consent "
         "once",
     )
+    incident_mails: bool = Field(
+        default=True,
+        description="mails to `alarm_email` when the event recorder keeps an incident, or cannot "
+        "([how](../how-to/recorder.md#mail-and-webhook)). `false`: only the webhook tells, if there is one",
+    )
     budget_usd: Annotated[int, Field(ge=0, le=1_000_000)] = Field(
         default=0,
         description="a monthly budget of the account, 0 for none: a mail at 80 % spent, and when the "

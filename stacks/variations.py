@@ -34,6 +34,7 @@ FLIPS: dict[str, dict[str, Any]] = {
         "robot_metrics": True,
         "function_logs": ALL_LOGS,
         "tags": {"team": "lab"},
+        "incident_mails": False,
         "low_voltage_v": 13.2,
         "high_temperature_degc": 70.0,
         "stream_behind_s": 30.0,

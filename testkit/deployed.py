@@ -15,6 +15,7 @@ import numpy as np
 from boto3.dynamodb.types import TypeSerializer
 
 from iort_contract.archive import DUE, TASK
+from iort_contract.catalog.streams import INCIDENT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.analysis import DriveKey, PlannedDrive, encode_planned
 from iort_contract.messages.batch import Batch, encode_batch
@@ -22,7 +23,17 @@ from iort_contract.messages.envelope import rule_event
 from iort_contract.messages.files import File, FileRequest, encode_file_request
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.messages.questions import Ask, encode_ask
-from iort_contract.tables import BATCH, PUT_OFF, RECEIVED_MS, ROBOT_PARAMETER, SERIAL_PARAMETER, TOPIC
+from iort_contract.messages.recorder import KEPT, Incident
+from iort_contract.tables import (
+    BATCH,
+    INCIDENT,
+    PUT_OFF,
+    RECEIVED_MS,
+    ROBOT_PARAMETER,
+    SERIAL_PARAMETER,
+    T_US,
+    TOPIC,
+)
 from iort_contract.topics import ASK, FILE, LAMBDA, LIVE, PING, RECORD, build_topic
 from testkit.runtime import Function
 
@@ -131,6 +142,11 @@ def events() -> dict[str, dict[str, Any]]:
             "start_us": 0,
             "end_us": 2**53,
             "again": False,
+        },
+        "incident": {
+            TOPIC: build_topic(RECORD, ROBOT, INCIDENT_STREAM),
+            T_US: now_us,
+            INCIDENT: Incident("0123456789abcdef", "hardbrake", now_us - 1, now_us, KEPT).sample(),
         },
         # A batch that expired while it waited.
         "later": {"Records": [{"messageId": "1", "body": json.dumps({PUT_OFF: [[topic, "1-0-0"]]})}]},

@@ -104,6 +104,8 @@ class Services:
             given = _JSON.get(operation, {})
             if operation == "GetParameter":
                 keys = {"publish_key": PUBNUB_KEY, "subscribe_key": PUBNUB_KEY, "origin": host, "tls": False}
+                if "/webhook" in body.decode():
+                    keys = {"url": "https://example.org/", "secret": PUBNUB_KEY}
                 given = {"Parameter": {"Name": "keys", "Value": json.dumps(keys)}}
             elif operation in {"Query", "Scan"}:
                 given = {"Items": self.items, "Count": len(self.items), "ScannedCount": len(self.items)}

@@ -23,6 +23,12 @@ ASKED_PREFIX = "asked_"
 ALERT_PREFIX = "alert_"
 # The fault's code follows, or "unknown".
 ALERT_FAULT, ALERT_LOW_VOLTAGE = f"{ALERT_PREFIX}fault_", f"{ALERT_PREFIX}low_voltage"
+# Registry: what was told of a robot's incidents last, and the hour (UTC) and the number of its mails.
+INCIDENT_PREFIX = "incident_"
+INCIDENTS_TOLD, INCIDENT_HOUR = f"{INCIDENT_PREFIX}told", f"{INCIDENT_PREFIX}hour"
+INCIDENT_MAILS = f"{INCIDENT_PREFIX}mails"
+# An event for the function incident: a sample of the stream `incidents`, beside its time and its topic.
+INCIDENT = "incident"
 STATS = ("min", "mean", "max", "last")
 # A second in the summary: samples, their batches, batches missing before those, gaps between samples, values
 # that were not finite.

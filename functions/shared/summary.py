@@ -11,7 +11,7 @@ from collections.abc import Set as AbstractSet
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from decimal import Decimal
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 from typing import Any
 
@@ -20,13 +20,14 @@ from botocore.config import Config
 from functions.shared import clients
 from functions.shared.clients import connect, variables
 from functions.shared.direct import Direct
+from functions.shared.incidents import Announcer
 from functions.shared.metrics import MOST_VALUES, emit
 from functions.shared.queues import DeadLetterQueue, Refused
 from functions.shared.seconds import SECOND_BATCHES, Summaries, keep_decoded, summarize_topic
 from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
 from functions.shared.tables import Tables
 from iort_contract.catalog.environments import LaterEnvironment
-from iort_contract.catalog.streams import AGENT_STREAM, RTT_FIELDS, RTT_STREAM
+from iort_contract.catalog.streams import AGENT_STREAM, INCIDENT_STREAM, RTT_FIELDS, RTT_STREAM
 from iort_contract.catalog.vesc import FAULT_FIELD, TEMPERATURES, VOLTAGE_FIELD, measured_degc
 from iort_contract.codec import Statistics
 from iort_contract.dynamodb import TableError, plain, quick
@@ -168,6 +169,8 @@ logging.getLogger("functions").setLevel(logging.INFO)
 
 
 Refuse = Callable[[Sequence[Refused]], Sequence[Refused]]
+# Tells of a topic's incidents; returns the batches to give again.
+Announce = Callable[[str, Sequence[Batch]], Sequence[Batch]]
 
 
 @dataclass(frozen=True)
@@ -189,6 +192,7 @@ def process(
     robot_metrics: bool = False,
     at_once: int = 1,
     news_since_ms: int = 0,
+    announce: Announce | None = None,
 ) -> dict[str, Any]:
     """Summarise the event's records. Undecodable records go to ``refuse``, since a retry would not help.
     Records over a robot's share wait, by ``bounds``. The answer names the records that were not taken there.
@@ -197,8 +201,8 @@ def process(
     and no second waits until the retries end. For a replay the answer names all undecodable records, which
     are in quarantine already. ``at_once`` topics are processed in parallel, since they are independent and
     mostly wait for the table. Records received before ``news_since_ms`` are summarised, but not counted in
-    metrics that have an alarm. If another function may summarise the same seconds ``beside`` this one, they
-    are read again after writing.
+    metrics that have an alarm, and their incidents are not announced. If another function may summarise the
+    same seconds ``beside`` this one, they are read again after writing.
     """
     decoded = decode_records(event["Records"], bounds.share if bounds else None)
     topics = _summarized(tables, decoded, at_once, bounds.share if bounds else None)
@@ -218,6 +222,11 @@ def process(
         left |= _put_off(bounds, decoded)
     good = [batch for batches in decoded.batches.values() for batch in batches]
     news = decoded.news(news_since_ms)
+    if announce is not None:
+        for topic, batches in news.items():
+            if parse_topic(topic).name == INCIDENT_STREAM:
+                untold = announce(topic, batches)
+                left |= {decoded.records[topic, batch.id]["SequenceNumber"] for batch in untold}
     emit(
         "summarize",
         BatchesSummarized=len(good),
@@ -327,6 +336,13 @@ def _summarized(
 
 
 @cache
+def _announcer() -> Announcer:
+    # Most environments see no incident, and need no client for it.
+    client = cache(partial(connect, "lambda"))
+    return Announcer(client, variables(LaterEnvironment).incident_function)
+
+
+@cache
 def stored_tables() -> Tables:
     """The tables of this environment's deployment."""
     given = variables(LaterEnvironment)
@@ -360,4 +376,5 @@ def processed(
         robot_metrics=given.robot_metrics,
         at_once=_AT_ONCE,
         news_since_ms=int(time.time() * 1000) - _NEWS_MS,
+        announce=_announcer().announce,
     )

@@ -20,6 +20,7 @@ from iort_contract.topics import SHADOW
 from stacks.checks import EVERY_RESOURCE, LOG_DELIVERY
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
+SSM = IOT.replace(":iot:", ":ssm:")
 STATES = "arn:${AWS::Partition}:states:${AWS::Region}:${AWS::AccountId}"
 THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"
 GROUP, KIND = f"{IOT}:thinggroup/iort-robot", f"{IOT}:thingtype/iort-robot"
@@ -62,6 +63,7 @@ REJECT = ("sqs:SendMessage", "Rejected.Arn")
 DESTINATION = {REJECT, ("sqs:GetQueueAttributes", "Rejected.Arn"), ("sqs:GetQueueUrl", "Rejected.Arn")}
 # Permissions of a function that reads batches and writes seconds.
 SUMMARIZES = {
+    ("lambda:InvokeFunction", "Incident.Arn"),
     ("dynamodb:Query", "Batches.Arn"),
     ("dynamodb:BatchWriteItem", "Summary.Arn"),
     ("dynamodb:GetItem", "Robots.Arn"),
@@ -92,7 +94,7 @@ def person(name: str, *lanes: str) -> set[tuple[str, str]]:
 
 # By function, beside the writing of its own log.
 OF_FUNCTIONS = {
-    "Live": DESTINATION | {("ssm:GetParameter", f"{IOT.replace(':iot:', ':ssm:')}:parameter/iort/pubnub")},
+    "Live": DESTINATION | {("ssm:GetParameter", f"{SSM}:parameter/iort/pubnub")},
     "Summarize": DESTINATION
     | SUMMARIZES
     | {
@@ -145,6 +147,9 @@ OF_FUNCTIONS = {
     "Admit": {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:DescribeCertificate", f"{IOT}:cert/*")},
     "Presence": DESTINATION | {("dynamodb:UpdateItem", "Robots.Arn")},
     "Alert": DESTINATION | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
+    "Incident": DESTINATION
+    | {("dynamodb:GetItem", "Robots.Arn"), ("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")}
+    | {("ssm:GetParameter", f"{SSM}:parameter/iort/webhook")},
     "Plan": READS_DRIVES
     | {
         ("dynamodb:Scan", "Robots.Arn"),
@@ -161,7 +166,8 @@ OF_FUNCTIONS = {
     },
     "Present": {(f"dynamodb:{action}", "Findings.Arn") for action in ("Query", "PutItem", "DeleteItem")}
     | {("s3:GetObject", f"Files.Arn/{PLANS_PREFIX}*"), ("sns:Publish", "Alarms")}
-    | {("s3:ListBucket", "Files.Arn"), ("s3:DeleteObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*")},
+    | {("s3:ListBucket", "Files.Arn"), ("s3:DeleteObject", f"Files.Arn/{ANALYSIS_PREFIX}robot=*")}
+    | {(f"iot:{verb}ThingShadow", f"{IOT}:thing/*/{SHADOW}") for verb in ("Get", "Update")},
 }
 # The topic rules' roles beside the sending of what fails.
 OF_RULES = {
@@ -208,6 +214,7 @@ ROLES = {
 # The attributes of a robot's row that each function may change.
 KEEPS = {
     "AlertRole": ("alert_*",),
+    "IncidentRole": ("incident_*",),
     "PresenceRole": PRESENCE,
     "LaterRole": (STREAMS,),
     "SummarizeRole": (RECORD_BYTES, RECORD_DAY, STREAMS),

@@ -50,7 +50,8 @@ class ArchiveEnvironment(Environment):
 
 @dataclass(frozen=True)
 class LaterEnvironment(Environment):
-    """What both summarizing functions need. Without an archive, ``archive_table`` is empty."""
+    """What both summarizing functions need. Without an archive, ``archive_table`` is empty. They give
+    incidents to ``incident_function``."""
 
     archive_table: str
     telemetry_table: str
@@ -58,6 +59,7 @@ class LaterEnvironment(Environment):
     robots_table: str
     rejected_queue: str
     robot_metrics: bool
+    incident_function: str
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,19 @@ class AlertEnvironment(Environment):
     robots_table: str
     alarm_topic: str
     low_voltage_v: float
+
+
+@dataclass(frozen=True)
+class IncidentEnvironment(Environment):
+    """The function that tells of incidents, by mail if ``incident_mails``, and by the webhook that the
+    parameter holds. Only an ``embedded`` cloud's may go to this machine by http."""
+
+    robots_table: str
+    alarm_topic: str
+    rejected_queue: str
+    webhook_parameter: str
+    incident_mails: bool
+    embedded: bool
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,11 @@ PRESENCE_CHART = "Robots: who comes and goes"
 ADMISSION_CHART = "Robots: admitted and refused, and pongs sent"
 FILES_CHART = "Robots: files"
 ARCHIVE_CHART = "Archive: hours a minute, and what is overdue or was put off"
+INCIDENTS_CHART = "Recorder: incidents told, and what failed"
 ASKS_CHART = "Robots: questions, and the time of an answer, p95 ms"
 # What the robots ask of the cloud, and what it does by itself: the rows of the services' dashboard.
 SERVICE_CHARTS: tuple[tuple[Chart, ...], ...] = (
-    (PRESENCE_CHART, ADMISSION_CHART),
+    (PRESENCE_CHART, ADMISSION_CHART, INCIDENTS_CHART),
     (FILES_CHART, ARCHIVE_CHART, ASKS_CHART),
 )
 # The rows of the robots' dashboard. QUEUES_CHART and LIVE_CHART are on the platform's.
@@ -220,6 +221,22 @@ METRICS = {
             for name in ("RoundTripBrokerMs", "RoundTripRuleMs", "RoundTripLambdaMs")
         ),
         *_counts("alert", FAULTS_CHART, "AlertsSent", "AlertsHeld", right=True),
+        *_counts("incident", INCIDENTS_CHART, "IncidentMails", "WebhooksSent"),
+        # Over a robot's mails of an hour.
+        *_counts("incident", INCIDENTS_CHART, "IncidentsHeld", right=True),
+        Metric(
+            "WebhooksFailed",
+            "incident",
+            INCIDENTS_CHART,
+            right=True,
+            alarm=Alarm(
+                "the webhook's receiver did not take incidents",
+                "`iort webhook test` says why. Each is tried nine times within some minutes, and is then in "
+                "quarantine: `iort errors`; mend the receiver, then `iort replay-errors`",
+                evidence="quarantine",
+            ),
+        ),
+        Metric("FindingTakes", "present", INCIDENTS_CHART),
         *_counts("presence", PRESENCE_CHART, "RobotsConnected", "RobotsDisconnected", "PresenceIgnored"),
         *_counts("admit", ADMISSION_CHART, "RobotsAdmitted", "RobotsRefused"),
         Metric("PongsSent", "echo", ADMISSION_CHART, right=True),

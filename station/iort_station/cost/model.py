@@ -55,7 +55,7 @@ UPDATE_BYTES, OWN_ITEM_BYTES, SAMPLE_BYTES, SAMPLE_ITEM_BYTES = 480, 236, 356, 2
 ARCHIVED_SHARE = 0.60
 # Bytes that the functions log in embedded metric format; a test compares them with functions/.
 _LIVE_LINE, _SUMMARIZE_LINE, _HEALTH_LINE, _PONG_LINE, _PRESENCE_LINE = 480, 310, 300, 220, 230
-_ANSWER_LINE, _ARCHIVE_LINE, _ANALYSIS_LINE = 260, 330, 260
+_ANSWER_LINE, _ARCHIVE_LINE, _ANALYSIS_LINE, _INCIDENT_LINE = 260, 330, 260, 225
 # Lambda's own lines START, END and REPORT of an invocation.
 PLATFORM_BYTES = 264
 
@@ -166,6 +166,7 @@ def capabilities(usage: Usage) -> dict[str, Table]:
             "read": 13 * questions,
             **_function(usage, questions, answer_mb, 30.0, questions * _ANSWER_LINE),
         },
+        "incidents": _incidents(usage) if usage.incidents_per_hour else {},
         "archive": _archive(usage) if usage.archive_days else {},
         "analysis": _analysis(usage) if usage.drive_minutes else {},
     }
@@ -183,6 +184,23 @@ def _kept(usage: Usage, *items: tuple[float, int]) -> Table:
     stored = sum(count * (size + _ITEM_OVERHEAD) for count, size in items)
     gb_months = stored / 1e9 * usage.retention_days / MONTH_DAYS
     return {"storage": gb_months, **({"recovery": gb_months} if usage.recoverable else {})}
+
+
+def _incidents(usage: Usage) -> Table:
+    """Incidents that are mailed and sent to a webhook, each with a sample when it opens and one when its file
+    is there; neither the file nor mails are counted here: the first thousand of a month are free. A sample is
+    a batch of its own, and a second. Its function reads the robot's row, and notes there, in up to 2 KB, what
+    it told; the receiver's answer takes most of its time."""
+    samples = 2 * usage.incidents_per_hour
+    # A mail when it opens is counted in the row; it and both messages of the webhook are noted.
+    noted = 1.5 * samples
+    return {
+        **dict.fromkeys(("rule", "action"), samples),
+        "read": 2 * samples,
+        "write": 2 * samples + 2 * noted + samples / 2,
+        **_kept(usage, (2 * samples, 4 * OWN_ITEM_BYTES)),
+        **_function(usage, samples, 256, 400.0, noted * _INCIDENT_LINE),
+    }
 
 
 def _archive(usage: Usage) -> Table:

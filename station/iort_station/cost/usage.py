@@ -49,6 +49,7 @@ class Usage:
     connects_per_hour: float = 1.0
     command_hz: float = 0.0
     questions_per_hour: float = 0.0
+    incidents_per_hour: float = 0.0
     hours_per_day: float = 2.0
     watched_hours: float | None = 2.0
     live_transport: str = IOT
@@ -62,9 +63,9 @@ class Usage:
     summarize_memory_mb: int = 512
     summarize_ms: float = 20.0
     function_logs: str = "own"
-    alarms: int = 41
-    insights_metrics: int = 63
-    dashboards: tuple[int, ...] = (49, 20, 22)
+    alarms: int = 43
+    insights_metrics: int = 65
+    dashboards: tuple[int, ...] = (49, 25, 22)
     dashboard_hours: float = 20.0
     robot_metrics: bool = False
     recoverable: bool = False

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract import tables
+from iort_contract.catalog.streams import INCIDENT_STREAM
 from iort_contract.checks import json_object
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
@@ -192,7 +193,8 @@ def replay(
     A record message whose rule failed is published to that rule again; it has arrived when the table holds
     its batch. A batch that Lambda 2 refused is given to Lambda 2 again. Then the dead letter is deleted.
     Each attempt is counted; after `MAX_REPLAYS` there are no more, unless ``again``. Live messages, pings and
-    events are outdated and are not replayed. Batches that were put off go back to their queue.
+    events are outdated and are not replayed. Batches that were put off go back to their queue. An incident of
+    which nobody could be told is told again.
     """
     one = partial(_outcome, cloud, dry_run=dry_run, again=again)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -206,7 +208,7 @@ def _outcome(cloud: Cloud, listed: DeadLetter, *, dry_run: bool, again: bool) ->
     batch = None
     try:
         _check_kind(letter)
-        if letter.source != tables.BY_LATER:
+        if letter.source != tables.BY_LATER and not _is_incident(letter):
             batch = _batch(letter)
     except _NotForReplayError as error:
         return Outcome(listed, Fate.NOT_FOR_REPLAY, str(error))
@@ -218,7 +220,9 @@ def _outcome(cloud: Cloud, listed: DeadLetter, *, dry_run: bool, again: bool) ->
         return Outcome(letter, Fate.WOULD)
     try:
         _count(cloud, letter)
-        if batch is None:
+        if _is_incident(letter):
+            problem = _told(cloud, letter)
+        elif batch is None:
             problem = _put_off(cloud, letter)
         elif _is_rules(letter):
             problem = _publish(cloud, letter, batch)
@@ -236,11 +240,17 @@ def _is_rules(letter: DeadLetter) -> bool:
     return letter.source.startswith(f"{tables.BY_RULE} ")
 
 
+def _is_incident(letter: DeadLetter) -> bool:
+    levels = letter.topic.split("/")
+    named = (levels[0], levels[-1]) == (RECORD, INCIDENT_STREAM)
+    return named and letter.source.startswith(f"{tables.BY_FUNCTION} ")
+
+
 def _check_kind(letter: DeadLetter) -> None:
-    if letter.source in (tables.BY_STREAM, tables.BY_LATER) and letter.topic:
+    if (letter.source in (tables.BY_STREAM, tables.BY_LATER) and letter.topic) or _is_incident(letter):
         return
     if not _is_rules(letter) or not letter.topic.startswith(f"{RECORD}/"):
-        raise _NotForReplayError("only batches of the record lane are replayed")
+        raise _NotForReplayError("only batches of the record lane, and incidents, are replayed")
 
 
 def _batch(letter: DeadLetter) -> Batch:
@@ -287,6 +297,15 @@ def _put_off(cloud: Cloud, letter: DeadLetter) -> str:
     queue = cloud.output("processing", "PutOffQueue")
     body = (letter.payload or b"").decode()
     cloud.client("sqs").send_message(QueueUrl=queue, MessageBody=body, MessageGroupId=letter.robot)
+    return ""
+
+
+def _told(cloud: Cloud, letter: DeadLetter) -> str:
+    """Have an incident told; returns the error, or nothing."""
+    try:
+        invoke(cloud, "processing", "IncidentFunction", letter.payload or b"{}", "the function incident")
+    except StationError as error:
+        return str(error)
     return ""
 
 

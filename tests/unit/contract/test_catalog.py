@@ -135,8 +135,8 @@ def test_every_metrics_chart_is_drawn():
     "written",
     [
         LiveEnvironment("iort", "/iort/pubnub", {"vesc": ["speed"], "imu": []}, "queue"),
-        LaterEnvironment("iort", "archive", "telemetry", "summary", "robots", "queue", robot_metrics=True),
-        LaterEnvironment("iort", "archive", "telemetry", "summary", "robots", "queue", robot_metrics=False),
+        LaterEnvironment("iort", "archive", "telemetry", "summary", "robots", "queue", True, "incident"),
+        LaterEnvironment("iort", "archive", "telemetry", "summary", "robots", "queue", False, "incident"),
         AlertEnvironment("iort", "robots", "topic", 10.5),
         UploadEnvironment("iort", "files", "robots", "queue", 50 * 10**9),
     ],

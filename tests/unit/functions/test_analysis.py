@@ -13,10 +13,12 @@ from typing import Any
 import boto3
 import numpy as np
 import pytest
+from botocore.exceptions import ClientError
 
 from functions import analyse, evaluate, plan, present
 from functions.shared import recordings
 from functions.shared.analysis import Kept
+from functions.shared.takes import MOST, Takes
 from iort_analysis.archive.columns import read_table
 from iort_analysis.archive.writing import write_hour
 from iort_analysis.results import DriveResult, Mined, encode_result
@@ -39,9 +41,20 @@ from iort_contract.messages.analysis import (
     encode_planned,
 )
 from iort_contract.messages.batch import Batch
+from iort_contract.messages.recorder import (
+    FINDING,
+    MAX_SPAN_S,
+    RECORDER,
+    TAKES,
+    TRIGGERS,
+    Trigger,
+    decode_take,
+    encode_trigger,
+)
+from iort_contract.messages.shadow import decode_desired
 from iort_contract.page import PAGE_URL
 from iort_contract.tables import ROBOT, STREAMS, TOPIC
-from iort_contract.topics import RECORD, build_topic
+from iort_contract.topics import RECORD, SHADOW, build_topic
 from testkit.dynamodb import ARCHIVE, FILES, FINDINGS, ROBOTS, TELEMETRY, item_of
 from tests.unit.analysis.simulated import HZ, START_US, changed, streams
 
@@ -591,3 +604,109 @@ def test_the_schedule_asks_for_the_last_days(cloud: Deployed) -> None:
 
     assert found["end_us"] - found["start_us"] == 86_400 * S
     assert cloud.robots() == [{"robot": CAR, "others": []}]
+
+
+# --- a robot keeps what its ring has of a finding -----------------------------------------------------
+
+
+def on_finding(name: str = "findings", **changes: Any) -> dict[str, Any]:
+    trigger = Trigger(name, on=FINDING, before_s=5, after_s=2, **changes)
+    return encode_trigger(trigger)[RECORDER][TRIGGERS]
+
+
+def shadow(triggers: dict[str, Any], takes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """A shadow as AWS answers it, without the nulls of a change."""
+    compact = {name: {k: v for k, v in one.items() if v is not None} for name, one in triggers.items()}
+    return {"state": {"desired": {RECORDER: {TRIGGERS: compact, TAKES: takes or {}}}}, "version": 7}
+
+
+class Shadows:
+    """AWS IoT's shadows of robots."""
+
+    class exceptions:
+        class ResourceNotFoundException(Exception):
+            pass
+
+    def __init__(self, **documents: Any) -> None:
+        self.documents, self.written = documents, []
+
+    def get_thing_shadow(self, *, thingName: str, shadowName: str) -> dict[str, Any]:
+        assert shadowName == SHADOW
+        if thingName not in self.documents:
+            raise self.exceptions.ResourceNotFoundException
+        document = self.documents[thingName]
+        if isinstance(document, Exception):
+            raise document
+        return {"payload": io.BytesIO(json.dumps(document).encode())}
+
+    def update_thing_shadow(self, *, thingName: str, shadowName: str, payload: str) -> None:
+        assert (thingName in self.documents, shadowName) == (True, SHADOW)
+        self.written.append(
+            (thingName, decode_desired(json.loads(payload)["state"]["desired"]).recorder.takes)
+        )
+
+
+def test_a_robot_with_a_trigger_on_findings_keeps_the_time_of_a_new_one(cloud: Deployed, capsys) -> None:
+    shadows = Shadows(car=shadow(on_finding(topics=("/camera/*",))))
+    for _ in range(2):
+        present.present(
+            [(finding().drive, [finding()])], cloud.table, lambda *_: None, PAGE_URL, Takes(shadows).ask
+        )
+    ((robot, takes),) = shadows.written
+    ((name, content),) = takes.items()
+    content = {key: value for key, value in content.items() if value is not None}
+    taken = decode_take(name, content)
+    assert (robot, taken.by, taken.why) == (CAR, "analysis", "cell_dropout: the battery drops")
+    assert (taken.from_us, taken.to_us) == (START_US - 5 * S, START_US + 22 * S)
+    assert taken.topics == ("/camera/*",)
+    assert '"FindingTakes":1' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {},
+        shadow({}),
+        shadow(on_finding(notify=True)),
+        shadow(encode_trigger(Trigger("stops", on="stop"))[RECORDER][TRIGGERS]),
+        shadow({"broken": {"on": FINDING, "before_s": -5}}),
+        {"state": {"desired": {RECORDER: 5}}},
+        ClientError({"Error": {"Code": "ThrottlingException"}}, "GetThingShadow"),
+    ],
+)
+def test_other_robots_get_no_take_and_no_finding_fails(document: Any) -> None:
+    shadows = Shadows(car=document)
+    assert Takes(shadows).ask(CAR, [finding()]) == Takes(shadows).ask("none", [finding()]) == 0
+    assert shadows.written == []
+
+
+def test_a_run_asks_for_few_takes_and_an_operators_stay() -> None:
+    now_us = time.time_ns() // 1000
+    own = {"0" * 16: {"from_us": now_us - S, "to_us": now_us, "by": "lab"}}
+    earlier = {
+        f"{n:016x}": {"from_us": START_US, "to_us": START_US + n * S, "by": "analysis"} for n in (1, 2)
+    }
+    shadows = Shadows(car=shadow({**on_finding(), **on_finding("more")}, {**own, **earlier}))
+    drives = [replace(finding(at_us=START_US + n * 60 * S), severity="notice") for n in range(5)]
+    serious = finding(at_us=START_US - 60 * S)
+    failed = replace(finding(), kind=ANALYSIS_FAILED)
+    assert Takes(shadows).ask(CAR, [failed, *drives, serious]) == MOST == 3
+    ((_, takes),) = shadows.written
+    assert [name for name, one in takes.items() if one is None] == list(earlier)
+    assert own.keys().isdisjoint(takes)
+    begins = [one["from_us"] + 5 * S for one in takes.values() if one is not None]
+    assert begins == [one.from_us for one in (serious, drives[4], drives[3])]
+    # Where the operator's fill the shadow, there is no room for others.
+    full = {f"{n:016x}": {"from_us": now_us - S, "to_us": now_us, "by": "lab"} for n in range(4)}
+    assert Takes(Shadows(car=shadow(on_finding(), full))).ask(CAR, drives) == 0
+
+
+def test_of_a_long_finding_the_end_is_taken() -> None:
+    hour = replace(finding(), to_us=START_US + 3600 * S)
+    shadows = Shadows(car=shadow({**on_finding(), **on_finding("all", topics=("vesc",))}))
+    assert Takes(shadows).ask(CAR, [hour]) == 1
+    ((_, takes),) = shadows.written
+    (content,) = takes.values()
+    assert content["to_us"] == START_US + 3602 * S
+    assert content["to_us"] - content["from_us"] == MAX_SPAN_S * S
+    assert content.get("topics") is None, "one trigger wants all topics"

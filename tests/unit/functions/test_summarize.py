@@ -366,6 +366,7 @@ def test_an_attribute_with_more_digits_than_boto3_reads_stops_no_summary(stream)
 def test_the_handler_works_on_the_templates_tables(dynamodb, monkeypatch, capsys):
     monkeypatch.setenv("PUT_OFF_QUEUE", "https://sqs.example/put-off")
     monkeypatch.setenv("ROBOT_METRICS", "false")
+    monkeypatch.setenv("INCIDENT_FUNCTION", "incident")
     monkeypatch.setenv("RECORD_BYTES_A_DAY", "1")
     # moto answers botocore alone.
     monkeypatch.setattr(Direct, "_answer", lambda *_: None)

@@ -41,6 +41,7 @@ VERBS = {
     "watch": ("live", "Show every car in the terminal, live, until Ctrl-C."),
     "site": ("page", "Upload the page to the stack iort-site, which serves it."),
     "alarms": ("alarms", "List the alarms with what to do, or acknowledge them."),
+    "webhook": ("webhook", "Send incidents to a program of yours, signed."),
     "errors": ("alarms", "List rejected messages, or show one."),
     "replay-errors": ("alarms", "Process rejected recordings again."),
     "doctor": ("upkeep", "Say what is wrong with the cloud, or will be, and what to do."),

@@ -35,6 +35,7 @@ _SETTINGS = {
     "connects_per_hour": "Connections of a robot in an hour.",
     "command_hz": "Commands a second to a robot.",
     "questions_per_hour": "Questions of a robot to the cloud in an hour.",
+    "incidents_per_hour": "Incidents of a robot's event recorder in an hour that are told.",
     "dashboard_hours": "Hours a month that the live page shows CloudWatch.",
 }
 

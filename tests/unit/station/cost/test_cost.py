@@ -86,6 +86,11 @@ CASES = [
     ({"command_hz": 10.0}, "commands", {"message": 3 * 10 * _HOUR}),
     ({}, "commands", {"message": 0}),
     ({"questions_per_hour": 5.0}, "questions", {"message": 4 * 5, "write": 5, "read": 13 * 5}),
+    (
+        {"incidents_per_hour": 4.0},
+        "incidents",
+        {"rule": 8, "invocation": 8, "read": 16, "write": 16 + 24 + 4},
+    ),
     # Three streams; their hours, days and nightly searches; only the driven one's objects are large.
     ({}, "archive", {"queue_request": 3 * 3 * (1 + 0.5 + 0.5), "s3_move": 0.5}),
     ({"rate_hz": 1.0, "hours_per_day": 0.1}, "archive", {"s3_instant": 0, "s3_move": 0}),
@@ -360,9 +365,13 @@ def test_the_modelled_length_of_other_lines_matches_the_real_lines(capsys, monke
     emit("summarize", BatchesSummarized=2, SamplesSummarized=100)
     emit("health", **measure("vesc", [message_sizes.batch_of(simulated_drive(50), 50)]))
     emit("echo", PongsSent=1)
+    emit("incident", WebhooksSent=1)
     emit("presence", RobotsConnected=True, RobotsDisconnected=False)
     lengths = [len(line) for line in capsys.readouterr().out.splitlines()]
-    modelled = [model._SUMMARIZE_LINE, model._HEALTH_LINE, model._PONG_LINE, model._PRESENCE_LINE]
+    modelled = [
+        *(model._SUMMARIZE_LINE, model._HEALTH_LINE, model._PONG_LINE),
+        *(model._INCIDENT_LINE, model._PRESENCE_LINE),
+    ]
     assert lengths == pytest.approx(modelled, rel=0.1)
 
 

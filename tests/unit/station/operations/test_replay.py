@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 from types import SimpleNamespace
 
 import pytest
 
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.tables import BY_LATER, BY_RULE, BY_STREAM, PUT_OFF
+from iort_contract.tables import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, PUT_OFF
 from iort_contract.topics import RECORD, build_topic
 from iort_station.operations.quarantine import DeadLetter, Fate, replay
 from testkit.dynamodb import item_of
@@ -116,3 +117,34 @@ def test_a_batch_is_replayed_with_and_without_basic_ingests_prefix(prefix):
 def test_keys_that_the_rule_ignores_do_not_stop_a_replay():
     odd = {**json.loads(encode_batch(GOOD)), "robot": "another", "topic": "dt/iort/another/vesc"}
     assert outcomes(odd=(f"{BY_RULE} iort_record", json.dumps(odd).encode())) == [Fate.WOULD]
+
+
+class Functions(Queues):
+    """A fake cloud that also has the function incident, which fails as ``error`` says."""
+
+    error = None
+
+    def client(self, service):
+        assert service in {"dynamodb", "lambda"}
+        return self
+
+    def invoke(self, *, FunctionName, Payload):
+        self.sent.append((FunctionName, json.loads(Payload)))
+        failed = {"FunctionError": "Unhandled"} if self.error else {}
+        answer = {"errorMessage": self.error} if self.error else None
+        return {"Payload": io.BytesIO(json.dumps(answer).encode()), **failed}
+
+
+def test_an_incident_that_nobody_could_be_told_of_is_told_again():
+    event = {"topic": build_topic(RECORD, "car", "incidents"), "t": 1, "incident": {}}
+    source = f"{BY_FUNCTION} iort-processing-Incident"
+    cloud = Functions({"told": (source, json.dumps(event).encode())}, topic=event["topic"])
+    listed = [DeadLetter("car", "told", source, event["topic"], "some", 1, 1, 1, 0)]
+    cloud.error = "the webhook at lab.example.org answered 500"
+    (outcome,) = replay(cloud, listed)
+    assert (outcome.fate, cloud.deleted) == (Fate.FAILED, [])
+    assert "answered 500" in outcome.detail
+    cloud.error = None
+    assert [outcome.fate for outcome in replay(cloud, listed)] == [Fate.REPLAYED]
+    assert cloud.sent == [("IncidentFunction", event)] * 2
+    assert cloud.deleted == ["told"]
