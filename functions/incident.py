@@ -64,7 +64,7 @@ class Sender(Protocol):
     def stored(self) -> bool:
         """Whether there is one."""
 
-    def deliver(self, body: bytes, delivery: str) -> int:
+    def deliver(self, body: bytes, delivery: str, tries: int = ...) -> int:
         """Send; return the receiver's status, or raise `WebhookError`."""
 
 
@@ -234,8 +234,8 @@ def handler(event: dict[str, Any], context: object) -> dict[str, int] | None:
     """Entry point of the calls by `summarize` and `later`, and of the operator's test message."""
     if TEST in event:
         body = json.dumps({"namespace": variables(IncidentEnvironment).namespace, TEST: True}).encode()
-        given = variables(IncidentEnvironment)
-        webhook = StoredWebhook(given.webhook_parameter, plain=given.embedded)
+        webhook = _ways().webhook
+        webhook.stored()
         return {"status": webhook.deliver(body, TEST, tries=1)}
     _told(event, context)
     return None

@@ -21,8 +21,6 @@ _log = logging.getLogger(__name__)
 TIMEOUT_S = 8.0
 # Between the tries of one invocation; with these, and the timeout of each, it ends within a minute.
 PAUSES_S = (1.0, 4.0)
-# A new webhook is used within this time.
-_LOOK_AGAIN_S = 60.0
 _SKIPPED_BYTES = 4096
 
 
@@ -32,7 +30,8 @@ class WebhookError(Exception):
 
 
 class StoredWebhook:
-    """The webhook in Parameter Store's ``parameter``, which may be stored or removed at any time."""
+    """The webhook in Parameter Store's ``parameter``, which is read for each message: a new one, or none,
+    holds at once."""
 
     def __init__(
         self,
@@ -45,15 +44,16 @@ class StoredWebhook:
         self._parameter, self._plain = parameter, plain
         self._clock, self._pause = clock, pause
         self._webhook: Webhook | None = None
-        self._looked_s = float("-inf")
 
     def stored(self) -> bool:
         """Whether there is one. Raises `WebhookError` if that cannot be known."""
-        return self._look() is not None
+        self._webhook = self._read()
+        return self._webhook is not None
 
     def deliver(self, body: bytes, delivery: str, tries: int = 1 + len(PAUSES_S)) -> int:
-        """Send a message; return the receiver's status, or raise `WebhookError` after the ``tries``."""
-        webhook = self._look()
+        """Send a message to the webhook that was `stored`; return the receiver's status, or raise
+        `WebhookError` after the ``tries``."""
+        webhook = self._webhook
         if webhook is None:
             raise WebhookError("no webhook is stored: `iort webhook set`")
         for pause_s in PAUSES_S[: tries - 1]:
@@ -88,13 +88,6 @@ class StoredWebhook:
         if not 200 <= answer.status < 300:
             raise WebhookError(f"{place} answered {answer.status}")
         return answer.status
-
-    def _look(self) -> Webhook | None:
-        now_s = self._clock()
-        if not 0 <= now_s - self._looked_s < _LOOK_AGAIN_S:
-            self._webhook = self._read()
-            self._looked_s = now_s
-        return self._webhook
 
     def _read(self) -> Webhook | None:
         ssm = connect("ssm")

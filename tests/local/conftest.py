@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
@@ -57,6 +58,37 @@ def bundle(
         return robots.add(embedded.cloud, name, out=tmp_path, settings=settings)
 
     return register
+
+
+@pytest.fixture
+def inbox(embedded: EmbeddedCloud) -> Iterator[Callable[[], list[Any]]]:
+    """Collect the messages to the subscribers of the alarm topic."""
+    cloud = embedded.cloud
+    topic, sqs = cloud.output("processing", "AlarmTopic"), cloud.client("sqs")
+    url = sqs.create_queue(QueueName=f"inbox-{time.time_ns()}")["QueueUrl"]
+    arn = sqs.get_queue_attributes(QueueUrl=url, AttributeNames=["QueueArn"])["Attributes"]["QueueArn"]
+    statement: dict[str, Any] = {
+        "Effect": "Allow",
+        "Principal": {"Service": "sns.amazonaws.com"},
+        "Action": "sqs:SendMessage",
+        "Resource": arn,
+        "Condition": {"ArnEquals": {"aws:SourceArn": topic}},
+    }
+    policy = json.dumps({"Version": "2012-10-17", "Statement": [statement]})
+    sqs.set_queue_attributes(QueueUrl=url, Attributes={"Policy": policy})
+    subscription = cloud.client("sns").subscribe(TopicArn=topic, Protocol="sqs", Endpoint=arn)
+    got: list[Any] = []
+
+    def received() -> list[Any]:
+        answer = sqs.receive_message(QueueUrl=url, MaxNumberOfMessages=10, WaitTimeSeconds=1)
+        for message in answer.get("Messages", []):
+            got.append(json.loads(message["Body"]))
+            sqs.delete_message(QueueUrl=url, ReceiptHandle=message["ReceiptHandle"])
+        return got
+
+    yield received
+    cloud.client("sns").unsubscribe(SubscriptionArn=subscription["SubscriptionArn"])
+    sqs.delete_queue(QueueUrl=url)
 
 
 @pytest.fixture

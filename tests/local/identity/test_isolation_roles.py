@@ -18,9 +18,10 @@ from botocore.config import Config
 from botocore.exceptions import ClientError
 
 from iort_contract.cloud import pubnub_parameter
+from iort_contract.webhook import webhook_parameter
 from iort_station.fleet.roles import role_arn
 from tests import isolation
-from tests.stacks.roles import IOT, PUBLIC
+from tests.stacks.roles import IOT, PUBLIC, SSM
 from tests.stacks.roles import ROLES as OF_AWS
 from tests.stacks.templates import name
 
@@ -140,15 +141,15 @@ def probes(deployed: list[Resource]) -> Iterator[Probe]:
             for key in isolation.OBJECTS:
                 call = {"GetObject": "get_object", "PutObject": "put_object", "DeleteObject": "delete_object"}
                 yield Probe(f"s3:{action}", f"{bucket.arn}.Arn/{key}", "s3", call[action], {**at, "Key": key})
-    parameter = {"Name": pubnub_parameter()}
-    each = {
-        "GetParameter": ("get_parameter", parameter),
-        "PutParameter": ("put_parameter", {**parameter, "Value": "x", "Overwrite": True}),
-        "DeleteParameter": ("delete_parameter", parameter),
-    }
-    for action in isolation.PARAMETER_ACTIONS:
-        arn = f"{IOT.replace(':iot:', ':ssm:')}:parameter{pubnub_parameter()}"
-        yield Probe(f"ssm:{action}", arn, "ssm", *each[action])
+    for name_ in (pubnub_parameter(), webhook_parameter()):
+        parameter = {"Name": name_}
+        each = {
+            "GetParameter": ("get_parameter", parameter),
+            "PutParameter": ("put_parameter", {**parameter, "Value": "x", "Overwrite": True}),
+            "DeleteParameter": ("delete_parameter", parameter),
+        }
+        for action in isolation.PARAMETER_ACTIONS:
+            yield Probe(f"ssm:{action}", f"{SSM}:parameter{name_}", "ssm", *each[action])
     for function in of(deployed, "AWS::Lambda::Function"):
         at = {"FunctionName": function.physical}
         each = {

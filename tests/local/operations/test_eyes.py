@@ -20,37 +20,6 @@ from tests.local.conftest import run_agent
 FAULT, LOW_V = 5, 9.5
 
 
-@pytest.fixture
-def inbox(embedded):
-    """Collect the messages to the subscribers of the alarm topic."""
-    cloud = embedded.cloud
-    topic, sqs = cloud.output("processing", "AlarmTopic"), cloud.client("sqs")
-    url = sqs.create_queue(QueueName=f"inbox-{time.time_ns()}")["QueueUrl"]
-    arn = sqs.get_queue_attributes(QueueUrl=url, AttributeNames=["QueueArn"])["Attributes"]["QueueArn"]
-    statement = {
-        "Effect": "Allow",
-        "Principal": {"Service": "sns.amazonaws.com"},
-        "Action": "sqs:SendMessage",
-        "Resource": arn,
-        "Condition": {"ArnEquals": {"aws:SourceArn": topic}},
-    }
-    policy = json.dumps({"Version": "2012-10-17", "Statement": [statement]})
-    sqs.set_queue_attributes(QueueUrl=url, Attributes={"Policy": policy})
-    subscription = cloud.client("sns").subscribe(TopicArn=topic, Protocol="sqs", Endpoint=arn)
-    got = []
-
-    def received():
-        answer = sqs.receive_message(QueueUrl=url, MaxNumberOfMessages=10, WaitTimeSeconds=1)
-        for message in answer.get("Messages", []):
-            got.append(json.loads(message["Body"]))
-            sqs.delete_message(QueueUrl=url, ReceiptHandle=message["ReceiptHandle"])
-        return got
-
-    yield received
-    cloud.client("sns").unsubscribe(SubscriptionArn=subscription["SubscriptionArn"])
-    sqs.delete_queue(QueueUrl=url)
-
-
 def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox, iort):
     cloud, bundle = embedded.cloud, bundle()
     now_us = time.time_ns() // 1000

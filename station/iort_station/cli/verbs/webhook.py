@@ -24,7 +24,7 @@ def set_(
 ) -> None:
     """Store the receiver's address with a new secret, which is printed once. The one before stops working."""
     made = store(context.obj.cloud(), url)
-    text = f"stored; the cloud uses it within a minute. The receiver's secret, shown only now:\n{made.secret}"
+    text = f"stored; the cloud uses it at once. The receiver's secret, shown only now:\n{made.secret}"
     tell({"url": made.url, "secret": made.secret}, text, as_json=as_json)
 
 
@@ -50,4 +50,4 @@ def remove_(context: typer.Context, yes: Yes = False, as_json: AsJson = False) -
     agreed(f"Remove the webhook of the deployment {cloud.namespace}?", yes=yes)
     if not remove(cloud):
         raise StationError("there is no webhook")
-    tell({"removed": True}, "removed; the cloud stops within a minute", as_json=as_json)
+    tell({"removed": True}, "removed; the cloud sends no more", as_json=as_json)

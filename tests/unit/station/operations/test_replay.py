@@ -56,8 +56,8 @@ def replayed(*, dry_run=True, **payloads):
 class Queues(FakeCloud):
     """A fake cloud that also has the queue of deferred batches."""
 
-    def __init__(self, payloads):
-        super().__init__(payloads)
+    def __init__(self, payloads, topic=TOPIC):
+        super().__init__(payloads, topic)
         self.sent, self.deleted = [], []
         self.exceptions = SimpleNamespace(ConditionalCheckFailedException=KeyError)
 
