@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import heapq
 import json
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -20,18 +19,18 @@ from iort_analysis.samples.blocks import values
 from iort_contract.catalog.derived import SOURCES
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.dynamodb import plain, with_samples_between
-from iort_contract.expression import ExpressionError, MismatchError
+from iort_contract.expression import MismatchError
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.batch import messages_of
 from iort_contract.messages.recorder import Trigger, decode_trigger
 from iort_contract.ros.message import MessageType
-from iort_contract.triggers import Edge, Evaluator, Window, check_trigger, evaluator_of, windows
+from iort_contract.triggers import Edge, Evaluator, Window, evaluator_of, windows
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, ros_messages
 from iort_station.data.queries import Result, query, samples
 from iort_station.data.recorded import Recorded, Selection
+from iort_station.data.triggers import fits, prepared, recorded_streams
 from iort_station.errors import StationError, UsageError, unknown
-from iort_station.fleet import registry
 from iort_station.fleet.control import Shadow
 
 # The windows whose messages are read, for the estimate of all.
@@ -94,14 +93,6 @@ def stored_trigger(cloud: Cloud, robot: str, name: str) -> Trigger:
         raise StationError(f"{robot}: the trigger {name} cannot be read: {error}") from error
 
 
-def with_vehicle(cloud: Cloud, robot: str, trigger: Trigger) -> Trigger:
-    """The trigger with the robot's own vehicle parameters, if it brings none."""
-    vehicle = None if trigger.gain else registry.vehicle_of(cloud, robot)
-    if vehicle is None:
-        return trigger
-    return replace(trigger, gain=vehicle.speed_to_erpm_gain, offset=vehicle.speed_to_erpm_offset)
-
-
 def dry_run(
     cloud: Cloud,
     robot: str,
@@ -116,11 +107,8 @@ def dry_run(
     Raises `UsageError` for a trigger that no robot accepts or that is no condition, and `StationError` for
     a robot, stream or field that is not there, and for a condition that mixes numbers and texts.
     """
-    trigger = with_vehicle(cloud, robot, trigger)
-    try:
-        evaluator = evaluator_of(check_trigger(trigger))
-    except (ContractError, ExpressionError) as error:
-        raise UsageError(str(error)) from error
+    trigger = prepared(cloud, robot, trigger, recorded_streams(cloud, robot))
+    evaluator = evaluator_of(trigger)
     if evaluator is None:
         raise UsageError(f"{trigger.name} is fired by {trigger.on}, which no stored sample tells")
     for stream in sorted(evaluator.streams):
@@ -233,12 +221,6 @@ def _uploads(cloud: Cloud, robot: str, trigger: Trigger, found: Sequence[Window]
         sizes = [size for window in measured for size in _sizes(recorded, own, window)]
         if sizes:
             yield Upload(stream, topics, round(len(sizes) * scale), round(sum(sizes) * scale))
-
-
-def fits(patterns: Sequence[str], *names: str) -> bool:
-    """Whether one of the names is one of the patterns', in which ``*`` stands for any characters."""
-    compiled = [re.compile(".*".join(map(re.escape, pattern.split("*")))) for pattern in patterns]
-    return any(pattern.fullmatch(name) for pattern in compiled for name in names)
 
 
 def _sizes(recorded: Recorded, kinds: Mapping[str, MessageType], window: Window) -> Iterator[int]:

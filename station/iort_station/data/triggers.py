@@ -26,31 +26,40 @@ _NEW = "(with --new it is added all the same)"
 
 
 def checked(cloud: Cloud, robot: str, trigger: Trigger, *, new: bool = False) -> Trigger:
-    """The trigger as the robot is to have it: with the other streams that its condition names, and the
-    vehicle's parameters that its derived fields need.
+    """As `prepared`, if the trigger can fire on the robot: its streams, fields and topics are recorded, or
+    ``new``. Raises `StationError` otherwise, and as `prepared`."""
+    streams = recorded_streams(cloud, robot)
+    trigger = prepared(cloud, robot, trigger, streams)
+    evaluator = triggers.evaluator_of(trigger)
+    if evaluator is not None and (own := evaluator.streams & OWN_STREAMS):
+        raise UsageError(f"{min(own)} is the agent's own stream, which fires no trigger")
+    if not new:
+        if evaluator is not None:
+            _check_fires(cloud, robot, evaluator, streams)
+        _check_topics(cloud, robot, trigger.topics, streams)
+    return trigger
 
-    Raises `UsageError` for a trigger that no robot accepts, and `StationError` for one that cannot fire on
-    this one: its streams, fields and topics must be recorded, except with ``new``.
+
+def prepared(cloud: Cloud, robot: str, trigger: Trigger, streams: AbstractSet[str]) -> Trigger:
+    """The trigger as the robot is to have it: with those of its ``streams`` that the condition names, and
+    with the vehicle's parameters that derived fields need, unless it has its own.
+
+    Raises `UsageError` for a trigger that no robot accepts, and `StationError` without these parameters.
     """
     try:
         rule = triggers.rule_of(trigger)
-        # The recorder hears what a robot's sources give, and not what its agent says.
-        streams = set(inventory.check_recorded(cloud, robot)) - OWN_STREAMS
         if rule is not None:
             trigger = _with_streams(rule, trigger, streams)
             trigger = _with_vehicle(cloud, robot, rule, trigger)
-        triggers.check_trigger(trigger)
+        return triggers.check_trigger(trigger)
     except (ContractError, ExpressionError) as error:
-        raise UsageError(f"{error}; nothing is changed") from error
-    evaluator = triggers.evaluator_of(trigger)
-    if evaluator is not None and (own := evaluator.streams & OWN_STREAMS):
-        raise UsageError(f"{min(own)} is the agent's own stream, which fires no trigger; nothing is changed")
-    if new:
-        return trigger
-    if evaluator is not None:
-        _check_fires(cloud, robot, evaluator, streams)
-    _check_topics(cloud, robot, trigger.topics, streams)
-    return trigger
+        raise UsageError(str(error)) from error
+
+
+def recorded_streams(cloud: Cloud, robot: str) -> set[str]:
+    """The streams that the recorder hears, as far as they are recorded: those of the robot's sources, and not
+    what its agent says."""
+    return set(inventory.check_recorded(cloud, robot)) - OWN_STREAMS
 
 
 def _with_streams(rule: Rule, trigger: Trigger, streams: AbstractSet[str]) -> Trigger:
@@ -61,14 +70,21 @@ def _with_streams(rule: Rule, trigger: Trigger, streams: AbstractSet[str]) -> Tr
 
 
 def _with_vehicle(cloud: Cloud, robot: str, rule: Rule, trigger: Trigger) -> Trigger:
-    needed = {field for name in rule.fields if PARAMETERS.get(field := name.rpartition(".")[2])}
-    if not needed:
+    fields = (name.rpartition(".")[2] for name in rule.fields)
+    needed = sorted(field for field in fields if PARAMETERS.get(field))
+    if not needed or trigger.gain:
         return trigger
     vehicle = registry.vehicle_of(cloud, robot)
     if vehicle is None:
-        field = min(needed)
-        raise StationError(f"{field} needs the {PARAMETERS[field][0]} of {robot}, which the registry lacks")
+        parameter = PARAMETERS[needed[0]][0]
+        raise StationError(f"{needed[0]} needs the {parameter} of {robot}, which the registry lacks")
     return replace(trigger, gain=vehicle.speed_to_erpm_gain, offset=vehicle.speed_to_erpm_offset)
+
+
+def fits(patterns: Iterable[str], *names: str) -> bool:
+    """Whether one of the names is one of the patterns', in which ``*`` stands for any characters."""
+    compiled = [re.compile(".*".join(map(re.escape, pattern.split("*")))) for pattern in patterns]
+    return any(pattern.fullmatch(name) for pattern in compiled for name in names)
 
 
 def _check_fires(cloud: Cloud, robot: str, evaluator: Evaluator, streams: AbstractSet[str]) -> None:
@@ -85,7 +101,7 @@ def _check_fires(cloud: Cloud, robot: str, evaluator: Evaluator, streams: Abstra
             evaluator.sample(stream, t_us, sample)
         evaluator.finish()
     except MismatchError as error:
-        raise UsageError(f"the condition cannot be evaluated: {error}; nothing is changed") from error
+        raise UsageError(f"the condition cannot be evaluated: {error}") from error
 
 
 def _samples(newest: Mapping[str, Block]) -> list[tuple[int, str, Mapping[str, object]]]:
@@ -104,8 +120,7 @@ def _check_topics(cloud: Cloud, robot: str, patterns: Sequence[str], streams: Ab
         return
     there = {*streams, *(kind.topic for _, kind in inventory.types_of(cloud, robot) if kind.topic)}
     for pattern in patterns:
-        compiled = re.compile(".*".join(map(re.escape, pattern.split("*"))))
-        if not any(map(compiled.fullmatch, there)):
+        if not fits([pattern], *there):
             raise _unknown(
                 f"{robot} has no topic and no stream that matches {pattern}", [pattern], there, robot
             )

@@ -129,7 +129,7 @@ def test_a_stream_is_silent_while_others_go_on() -> None:
         (Trigger("a", "silent(scan, 1s)"), StationError, "car has no stream scan"),
         (Trigger("a", "speed == 'map'"), StationError, "cannot compare a number with a text"),
         (Trigger("a", "speed >"), UsageError, "invalid expression"),
-        (Trigger("a", "speed_mps > 2"), UsageError, "speed_mps needs the vehicle's parameters"),
+        (Trigger("a", "speed_mps > 2"), StationError, "speed_mps needs the speed_to_erpm_gain of car"),
         (Trigger("a", on="stop"), UsageError, "a is fired by stop, which no stored sample tells"),
     ],
 )
