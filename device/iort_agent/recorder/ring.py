@@ -305,8 +305,9 @@ class _Kept:
     def __call__(self, stream: str, t_us: int, values: Mapping[str, Any], *, more: bool = False) -> float:
         only = self._only
         if stream == TYPES_STREAM:
-            # A message's type is with it; of streams that are not recorded, nobody else needs it.
-            return 0.0 if values.get("stream") in only else self._emit(stream, t_us, values, more=more)
+            # Each message is kept with its type. Of a stream that is not recorded, too, the type is: so the
+            # operator's commands know that the topic is there.
+            return self._emit(stream, t_us, values, more=more)
         self._ring.take(stream, t_us, values)
         nothing = stream in only
         if isinstance(values, Selected):
