@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 from iort_contract.limits import ContractError
@@ -19,10 +20,12 @@ from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError, unknown
 from iort_station.fleet import registry
-from iort_station.fleet.control import Shadow, State
+from iort_station.fleet.control import Shadow, State, read
 
 # Others may change the shadow at the same time; each time one of them has done.
 _TRIES = 20
+# A fleet is read at once, not robot by robot.
+_AT_ONCE = 32
 # A robot that the registry does not yet know to be connected may still answer.
 _OFFLINE_S = 2.0
 # After this, an answer that is as it was before is one to the change.
@@ -52,18 +55,23 @@ class Answer(NamedTuple):
         return self.text not in {"", ACCEPTED}
 
 
-def triggers(cloud: Cloud, robot: str) -> list[RobotTrigger]:
-    """The triggers that a robot is to have, by name, beside its answers."""
-    state = Shadow(cloud, robot).read()
-    answers, listed = state.reported.recorder, list[RobotTrigger]()
+def triggers(cloud: Cloud, robots: Collection[str]) -> list[RobotTrigger]:
+    """The triggers that robots are to have, by robot and name, beside the robots' answers."""
+    # Threads share a client, and must not make it at the same time.
+    data = cloud.client("iot-data")
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        each = pool.map(lambda robot: (robot, read(data, registry.checked(robot))), robots)
+        return [row for robot, state in each for row in _listed(robot, state)]
+
+
+def _listed(robot: str, state: State) -> Iterator[RobotTrigger]:
     for name, content in sorted(state.desired.recorder.triggers.items()):
         trigger, problem = None, ""
         try:
             trigger = messages.decode_trigger(name, content)
         except ContractError as error:
             problem = str(error)
-        listed.append(RobotTrigger(robot, name, trigger, answers.get(name, ""), problem))
-    return listed
+        yield RobotTrigger(robot, name, trigger, state.reported.recorder.get(name, ""), problem)
 
 
 def add(cloud: Cloud, robot: str, trigger: Trigger, seconds: float, *, withdraw: bool = True) -> Answer:

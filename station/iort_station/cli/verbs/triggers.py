@@ -102,7 +102,9 @@ def list_(
     cloud = context.obj.cloud()
     names = robots or sorted(str(row["robot"]) for row in registry.listed(cloud))
     with errors.status("reading"):
-        rows = [row for robot in names for row in recorder.triggers(cloud, robot)]
+        rows = recorder.triggers(cloud, names)
+    for robot in {*(robots or [])} - {row.robot for row in rows}:
+        registry.get(cloud, robot)
     if rows and not as_json:
         out.print(_table(rows))
         return

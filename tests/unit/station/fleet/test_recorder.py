@@ -234,9 +234,17 @@ def test_a_robot_has_only_so_many_triggers(lab):
 
 def test_what_this_station_cannot_read_is_listed_with_the_reason(lab):
     lab.states["car"] = {"desired": {"recorder": {"triggers": {"later": {"on": "flood"}}}}}
-    (listed,) = recorder.triggers(lab, "car")
+    (listed,) = recorder.triggers(lab, ["car"])
     assert listed.trigger is None
     assert "on must be one of" in listed.problem
+
+
+def test_a_name_that_nobody_has_claimed_yet_has_no_triggers(lab, iort):
+    recorder.add(lab, "car", BRAKE, 0)
+    lab.table.put(ROBOTS, {"robot": serialize("unclaimed")})
+    assert len(json.loads(iort("recorder", "list", "--json").stdout)) == 1
+    assert "no triggers" in iort("recorder", "list", "unclaimed").stderr
+    assert "robot ca is not registered" in str(iort("recorder", "list", "ca").exception)
 
 
 def test_changes_of_others_at_the_same_time_are_not_lost(lab):
