@@ -2,7 +2,7 @@
 
 ```
   sources ── around ──► bounded memory ── thread ──► open chunk ──► segment ──► ... ──► evicted
-                │              0.2 s           0.5 s or 1 MB   10 s or 8 MB
+                │              0.2 s           0.3 s or 1 MB   10 s or 8 MB
                 ▼
           attachments, lanes
 ```
@@ -53,7 +53,7 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-# How often the thread looks: a message is in a closed chunk after at most `LOOK_S` + `CHUNK_S` + `LOOK_S`.
+# How often the thread looks: a message is in a closed chunk after at most twice this and `CHUNK_S`.
 LOOK_S = 0.2
 # Bytes that wait and do not wait for the next look.
 _HURRY_BYTES = 4 * 1024 * 1024

@@ -17,7 +17,7 @@ from iort_agent.recorder.segment import SegmentFile, json_channel, json_message,
 _log = logging.getLogger(__name__)
 
 # A chunk is closed after this time or these bytes.
-CHUNK_S, CHUNK_BYTES = 0.4, 1024 * 1024
+CHUNK_S, CHUNK_BYTES = 0.3, 1024 * 1024
 _BOUNDS_S = 1.0
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
