@@ -22,6 +22,7 @@ from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.expression import MismatchError
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.batch import messages_of
+from iort_contract.messages.files import ATTACHMENT_AT
 from iort_contract.messages.recorder import Trigger, decode_trigger
 from iort_contract.ros.message import MessageType
 from iort_contract.triggers import Edge, Evaluator, Window, evaluator_of, windows
@@ -237,7 +238,8 @@ def _of_item(item: Item, layouts: Mapping[str, str], window: Window) -> Iterator
     except ContractError:
         return
     # What was cut out of a message is in the ring.
-    cut = [column for name, column in batch.columns.items() if name.endswith(".size")]
+    fields = [name[: -len(ATTACHMENT_AT) - 1] for name in batch.columns if name.endswith(f".{ATTACHMENT_AT}")]
+    cut = [batch.columns[f"{name}.size"] for name in fields if f"{name}.size" in batch.columns]
     for i, t_us in enumerate(batch.times_us):
         if not window.from_us <= t_us <= window.to_us:
             continue

@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 from iort_agent.recorder.triggers import Triggers
 from iort_agent.sources.recording import BagConfig
 from iort_contract.catalog.streams import TYPES_STREAM
-from iort_contract.messages.batch import Batch
+from iort_contract.messages.batch import Batch, Messages
 from iort_contract.messages.recorder import Trigger, encode_trigger
+from iort_contract.ros.message import MessageType
 from iort_contract.triggers import Edge, evaluator_of
 from iort_station.cli.verbs import recorder
 from iort_station.cost.incidents import incident_dollars
@@ -275,3 +276,22 @@ def test_incidents_cost_their_requests_and_a_month_of_storage() -> None:
     few, many = incident_dollars(1, 10**9), incident_dollars(1, 10**10)
     assert many[1] == pytest.approx(10 * few[1]) == pytest.approx(0.23)
     assert few[0] < many[0] < 0.02
+
+
+def test_messages_count_with_their_bytes_and_what_was_cut_out_of_them() -> None:
+    cloud = stored(ride(), gain=4614.0)
+    kind = MessageType("image", "/camera/left/image", "lab_msgs/Frame", "0" * 32, "uint8[] data\n")
+    cut = {"data.at": 0, "data.key": "k", "data.sha256": "0" * 64, "data.size": 100_000}
+    for second in range(60):
+        times = [START + second * S + i * 200 * MS for i in range(5)]
+        columns = {name: [of] * 5 for name, of in {**cut, "data.content_type": "image/png"}.items()}
+        raws = Messages(kind.id, kind.layout, [b"\0\0\0\0"] * 5)
+        batch = Batch("0badcafe", second, times, columns, 0, raws)
+        cloud.table.put(TELEMETRY, item_of(batch, topic="dt/iort/car/image"))
+    told = Batch("0badcafe", 0, [START], {name: [of] for name, of in kind.sample().items()})
+    cloud.table.put(TELEMETRY, item_of(told, topic=f"dt/iort/car/{TYPES_STREAM}"))
+    found = dry_run(cloud, "car", Trigger(**{**vars(BRAKE), "topics": ("/camera/*",)}))
+    (upload,) = found.uploads
+    assert (upload.stream, upload.topics) == ("image", ("/camera/left/image",))
+    assert upload.messages == 51 + 51 + 50
+    assert upload.bytes == upload.messages * (100_000 + 4 + 47)
