@@ -52,6 +52,12 @@ def stored(samples: list[Sample], *, gain: float | None = None) -> FakeCloud:
     return cloud
 
 
+def announce(cloud: FakeCloud, kind: MessageType) -> None:
+    """Store the type that a publisher gives its messages."""
+    told = Batch("0badcafe", 0, [START], {name: [of] for name, of in kind.sample().items()})
+    cloud.table.put(TELEMETRY, item_of(told, topic=f"dt/iort/car/{TYPES_STREAM}"))
+
+
 def ride(n: int = 600) -> list[Sample]:
     """A minute at 10 Hz that brakes three times."""
     return [
@@ -140,6 +146,15 @@ def test_what_is_not_there_or_not_allowed_is_said(
     with pytest.raises(error) as raised:
         dry_run(stored(ride(10)), "car", trigger)
     assert told in str(raised.value)
+
+
+def test_the_other_streams_of_a_condition_need_no_names() -> None:
+    samples = [*ride(100), *[("pose", START + i * S, {"x": i}) for i in range(10)]]
+    cloud = stored(samples)
+    announce(cloud, MessageType("pose", "/pose", "lab_msgs/Pose", "0" * 32, "int32 x\n"))
+    found = dry_run(cloud, "car", Trigger("a", "speed > 1 and pose.x >= 4"))
+    assert [edge.t_us for edge in found.edges] == [START + 4 * S]
+    assert found.trigger.others == ("pose",)
 
 
 def test_an_empty_range_has_no_edges() -> None:
@@ -288,8 +303,7 @@ def test_messages_count_with_their_bytes_and_what_was_cut_out_of_them() -> None:
         raws = Messages(kind.id, kind.layout, [b"\0\0\0\0"] * 5)
         batch = Batch("0badcafe", second, times, columns, 0, raws)
         cloud.table.put(TELEMETRY, item_of(batch, topic="dt/iort/car/image"))
-    told = Batch("0badcafe", 0, [START], {name: [of] for name, of in kind.sample().items()})
-    cloud.table.put(TELEMETRY, item_of(told, topic=f"dt/iort/car/{TYPES_STREAM}"))
+    announce(cloud, kind)
     found = dry_run(cloud, "car", Trigger(**{**vars(BRAKE), "topics": ("/camera/*",)}))
     (upload,) = found.uploads
     assert (upload.stream, upload.topics) == ("image", ("/camera/left/image",))
