@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from iort_contract.messages.recorder import NOTIFIED, UPLOADED, Incident
+from iort_contract.messages.recorder import LOST, OVER_BUDGET, UPLOADED, Incident
 from iort_station.cli import options
 from iort_station.cli.console import errors, listing, out, table
 from iort_station.cli.options import AsJson, Force, OneRobot, When, argument, examples, option, ranged
@@ -124,7 +124,7 @@ def _one(found: list[RobotIncident], id_: str) -> RobotIncident:
 
 
 def _failed(one: RobotIncident) -> bool:
-    return one.incident.state not in {UPLOADED, NOTIFIED} and bool(one.incident.why)
+    return one.incident.state in {LOST, OVER_BUDGET} and bool(one.incident.why)
 
 
 def _table(found: list[RobotIncident]) -> Any:

@@ -80,14 +80,15 @@ def test_a_sample_that_is_no_incident_is_passed_over(lab):
 def test_a_table_of_incidents_says_why_one_is_not_uploaded(lab, iort):
     lab.tell(incident(OVER_BUDGET, why="brake has spent its 500 MB"), START)
     lab.tell(incident(UPLOADED, number=2, bytes=12_300_000, missing=3), START)
+    lab.tell(incident(KEPT, number=3, why="speed=3"), START)
     done = iort("incidents", "car")
     assert done.exit_code == 0, done.output
     rows = [" ".join(line.split()) for line in done.stdout.splitlines()]
     assert "2023-11-14 22:13:20 car 40 s brake over budget 00000001" in rows
     assert "2023-11-14 22:13:20 car 40 s brake uploaded 12.3 MB 3 00000002" in rows
-    assert "car 00000001: brake has spent its 500 MB" in done.stderr
+    assert done.stderr == "car 00000001: brake has spent its 500 MB\n"
     told = json.loads(iort("incidents", "--json").stdout)
-    assert [one["id"] for one in told] == ["00000001", "00000002"]
+    assert [one["id"] for one in told] == ["00000001", "00000002", "00000003"]
     assert (told[1]["from"], told[1]["bytes"]) == ("2023-11-14T22:13:20.000000Z", 12_300_000)
     assert "no incidents in this range" in iort("incidents", "van").stderr
     assert "van1 is not registered" in str(iort("incidents", "van1").exception)
