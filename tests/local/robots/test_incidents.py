@@ -12,10 +12,24 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
+from iort_contract.catalog.analysis import SERIOUS
 from iort_contract.catalog.streams import INCIDENT_STREAM
+from iort_contract.cloud import findings_key
+from iort_contract.messages.analysis import DriveKey, Finding, encode_finding
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.messages.recorder import KEPT, LOST, UPLOADED, Incident
+from iort_contract.messages.recorder import (
+    FINDING,
+    KEPT,
+    LOST,
+    UPLOADED,
+    Incident,
+    Trigger,
+    decode_take,
+    encode_trigger,
+)
 from iort_contract.topics import record_topic
+from iort_station.cloud import invoke
+from iort_station.fleet.control import Shadow
 from iort_station.operations import quarantine
 from local.deployment import ROOT
 from testkit.mqtt import Robot
@@ -119,3 +133,27 @@ def test_a_receiver_that_fails_is_asked_again_and_then_the_incident_is_in_quaran
     assert iort("replay-errors", "--robot", car.robot).exit_code == 0
     assert [failing for failing, *_ in receiver.requests[name][9:]] == [False]
     assert not list(quarantine.entries(embedded.cloud, robot=car.robot))
+
+
+def test_a_new_finding_has_a_robot_with_a_trigger_on_findings_keep_its_time(embedded, bundle):
+    cloud, car, other = embedded.cloud, bundle(), bundle("other")
+    shadow, without = Shadow(cloud, car.robot), Shadow(cloud, other.robot)
+    shadow.desire(encode_trigger(Trigger("found", on=FINDING, before_s=5, after_s=2)))
+    t_us = time.time_ns() // 1000 - 60_000_000
+    bucket, job = cloud.output("storage", "FilesBucket"), f"test-{time.time_ns()}"
+    for robot in (car.robot, other.robot):
+        drive = DriveKey(robot, t_us, RUN)
+        found = Finding(
+            drive, "cell_dropout", SERIOUS, "cell_dropout", t_us, t_us + 1, "vesc", (), "it drops"
+        )
+        content = {"drives": [{"drive": vars(drive), "findings": [encode_finding(found)]}], "gone": []}
+        key, body = findings_key(job, robot), json.dumps(content).encode()
+        cloud.client("s3").put_object(Bucket=bucket, Key=key, Body=body)
+        for _ in range(2):
+            asked = json.dumps({"job": job, "robot": robot}).encode()
+            invoke(cloud, "analysis", "PresentFunction", asked, "Present")
+    ((name, take),) = shadow.read().desired.recorder.takes.items()
+    decoded = decode_take(name, take)
+    assert (decoded.from_us, decoded.to_us) == (t_us - 5_000_000, t_us + 1 + 2_000_000)
+    assert (decoded.by, decoded.why) == ("analysis", "cell_dropout: it drops")
+    assert not without.read().desired.recorder.takes
