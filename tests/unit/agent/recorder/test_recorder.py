@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import threading
 from dataclasses import replace
@@ -38,6 +39,7 @@ from testkit.agent import Loopback, ManualClock, MemorySpool
 from testkit.waiting import until
 from tests.unit.agent.control.downlink_rig import FakeGraph
 from tests.unit.agent.control.test_peers import string
+from tests.unit.agent.recorder import killed
 from tests.unit.agent.recorder.rig import BRAKE, T0, S
 from tests.unit.agent.test_agent import Script
 
@@ -284,3 +286,36 @@ def test_the_uploads_tell_the_recorder(running: Callable[..., Agent], tmp_path: 
     assert kept.state == KEPT
     folder.on_uploaded(Path(path.name), kept.key)
     assert kept.state == UPLOADED
+
+
+def test_kill_9_in_the_window_costs_less_than_a_second_of_it(tmp_path: Path) -> None:
+    def start() -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, "-m", killed.__name__, str(tmp_path)])
+
+    plan, folder = tmp_path / "ring" / "recorder.json", tmp_path / "ring" / "incidents"
+
+    def edges() -> list[Any]:
+        return json.loads(plan.read_text())["incidents"] if plan.exists() else []
+
+    process = start()
+    try:
+        (open_,) = until(edges, within_s=60.0)
+        process.kill()
+        process.wait()
+        kill_us = int((tmp_path / "sent").read_text().split()[-1])
+        process = start()
+        until(lambda: list(folder.glob("*.mcap")), within_s=60.0)
+    finally:
+        process.kill()
+        process.wait()
+    (path,) = folder.glob("*.mcap")
+    assert path.name == f"hardbrake-{open_['id']}.mcap"
+    with path.open("rb") as file:
+        mcap = reader.make_reader(file, validate_crcs=True)
+        found = [int(message.data) for _, _, message in mcap.iter_messages(topics=["/chatter"])]
+    times = [int(line) for line in (tmp_path / "sent").read_text().split()]
+    window = [t_us for t_us in times if open_["from_us"] <= t_us <= open_["to_us"]]
+    lost = sorted({*window} - {*found})
+    # The chunk that was open when the process was killed.
+    assert all(kill_us - S < t_us <= kill_us for t_us in lost)
+    assert min(window) == min(found) < kill_us
