@@ -230,6 +230,11 @@ def newest_block(cloud: Cloud, robot: str, stream: str) -> Block:
     return EMPTY if last is None else recorded.block(last)
 
 
+def first_fields(cloud: Cloud, robot: str, stream: str) -> set[str]:
+    """The fields of a stream's first stored samples."""
+    return _fields(cloud, Selection(robot=robot, stream=stream))
+
+
 def _fields(cloud: Cloud, selection: Selection) -> set[str]:
     """The fields of the first stored samples in the selection's range."""
     keys = with_samples_between(selection.start_us, selection.end_us)

@@ -92,7 +92,8 @@ def _check_fires(cloud: Cloud, robot: str, evaluator: Evaluator, streams: Abstra
         raise _unknown(f"{robot} has no stream {stream}", [stream], streams, robot)
     newest = {stream: inventory.newest_block(cloud, robot, stream) for stream in sorted(evaluator.streams)}
     for stream, named in evaluator.fields.items():
-        there = newest[stream].columns.keys()
+        # Since then, fewer fields may be recorded; the trigger is evaluated on all.
+        there = newest[stream].columns.keys() | inventory.first_fields(cloud, robot, stream)
         possible = there | {name for name in DERIVED if there >= set(SOURCES[name])}
         if missing := sorted({field for _, field in named} - possible):
             raise _unknown(f"{robot} has no {', '.join(missing)} in {stream}", missing, possible, robot)

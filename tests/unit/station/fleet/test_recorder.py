@@ -164,6 +164,12 @@ def test_a_derived_field_needs_the_cars_gain_also_if_it_is_new(lab):
         triggers.checked(lab, "van", BRAKE, new=True)
 
 
+def test_a_field_that_is_not_recorded_any_more_may_fire(lab):
+    lab.record("vesc", {"speed": [1, 2]}, START + 60 * S)
+    trigger = Trigger("t", when="fault_code != 0 and speed > 3")
+    assert triggers.checked(lab, "car", trigger) == trigger
+
+
 def test_what_is_said_to_come_is_not_looked_for(lab):
     trigger = Trigger("t", when="sped > 3 and silent(imu, 1s)", topics=("/camera/*",))
     assert triggers.checked(lab, "car", trigger, new=True) == trigger
