@@ -27,7 +27,7 @@ from iort_agent.control.commands import Operator, refuse_commands
 from iort_agent.control.downlink import make_downlink
 from iort_agent.control.guard import NODES, StopFile
 from iort_agent.control.shadow import NO_RECORDER, Shadow
-from iort_agent.errors import AgentError
+from iort_agent.errors import AgentError, SourceError
 from iort_agent.files.folder import make_uploads
 from iort_agent.files.upload import make_uploader
 from iort_agent.lanes import RuntimeSettings
@@ -199,7 +199,8 @@ class Agent:
 
     def _make_recorder(self, graph: Graph | None) -> Recorder | None:
         """The recorder of a configuration that has one. A program's service and topic are in the ROS node of
-        the sources, or in a ``graph`` that is no ROS graph. Raises `AgentError` without the package mcap."""
+        the sources, or in a ``graph`` that is no ROS graph. Raises `AgentError` without the package mcap,
+        and `SourceError` without ROS for them."""
         config = self.config
         if config.recorder is None:
             return None
@@ -207,7 +208,13 @@ class Agent:
         if config.recorder.service is None and config.recorder.topic is None:
             graph = None
         elif graph is None or ros.node is not None:
-            graph = NODES[ros.version](ros.node or DEFAULT_NODE, self.clock)
+            try:
+                graph = NODES[ros.version](ros.node or DEFAULT_NODE, self.clock)
+            except SourceError as error:
+                raise SourceError(
+                    f"recorder.service and recorder.topic need ROS {ros.version}; without it remove them "
+                    f"from car.yaml: {error}"
+                ) from error
         require_mcap()
         try:
             return Recorder(
