@@ -296,10 +296,10 @@ class Reader:
         while not isinstance(at, ast.Name):
             if isinstance(at, ast.Attribute):
                 path.append(at.attr)
-            elif isinstance(at, ast.Subscript) and isinstance(at.slice, ast.Constant):
-                if type(at.slice.value) is not int:
-                    raise self.error("an index must be a number", at.slice)
-                path.append(str(at.slice.value))
+            elif isinstance(at, ast.Subscript) and isinstance(index := _index(at), ast.Constant):
+                if type(index.value) is not int:
+                    raise self.error("an index must be a number", index)
+                path.append(str(index.value))
             else:
                 raise self.error("not a field", node)
             at = at.value
@@ -359,6 +359,12 @@ class Reader:
     def _characters(self, offset: int) -> int:
         # ast counts bytes of UTF-8.
         return len(self.text.encode()[:offset].decode(errors="ignore"))
+
+
+def _index(node: ast.Subscript) -> ast.expr:
+    """What stands in the brackets; Python 3.8 wraps it."""
+    wrapped: ast.expr = getattr(node.slice, "value", node.slice)
+    return wrapped if type(node.slice).__name__ == "Index" else node.slice
 
 
 def _is_none(node: ast.expr) -> bool:

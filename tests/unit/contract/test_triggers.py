@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
+from typing import Any, Tuple
 
 import pytest
 from hypothesis import given
@@ -45,7 +45,7 @@ from iort_contract.triggers import (
 from tests.trigger_vectors import MS, VECTORS, Vector
 
 S = 1_000_000
-Sample = tuple[str, int, Any]
+Sample = Tuple[str, int, Any]
 
 
 def edges_of(evaluator: Evaluator, samples: list[Sample]) -> list[Edge]:
@@ -73,7 +73,7 @@ def test_samples_make_the_edges_of_the_table(name: str) -> None:
 def test_neither_the_order_of_arrival_nor_a_clock_changes_an_edge(name: str, data: st.DataObject) -> None:
     made, samples = of_vector(VECTORS[name])
     late = data.draw(st.lists(st.integers(0, SETTLE_US - 1), min_size=len(samples), max_size=len(samples)))
-    arrived = [sample for _, sample in sorted(zip(late, samples, strict=True), key=lambda s: s[0] + s[1][1])]
+    arrived = [sample for _, sample in sorted(zip(late, samples), key=lambda s: s[0] + s[1][1])]
     found, newest = [], 0
     for stream, t_us, values in arrived:
         found += made.sample(stream, t_us, values)
@@ -169,7 +169,8 @@ def test_a_condition_outside_the_language_is_shown_where(when: str, place: int, 
     with pytest.raises(ExpressionError) as raised:
         parse_trigger(when)
     assert told in str(raised.value)
-    assert raised.value.position == place
+    # Of an invalid syntax, each Python has its own place.
+    assert abs(raised.value.position - place) <= ("invalid" in told)
 
 
 @given(st.text(max_size=30) | st.text("xs1.()' ,><=deltasilentfor", max_size=40))
