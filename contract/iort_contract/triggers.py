@@ -35,9 +35,8 @@ _FAULT_WHEN = "fault_code"
 _UNITS = {"ms": 1_000, "s": 1_000_000, "m": 60_000_000, "min": 60_000_000, "h": 3_600_000_000}
 _DURATION = r"(\d+(?:\.\d+)?)\s?(ms|s|min|m|h)\b"
 _FOR = re.compile(r"\sfor\s+(\S.*)$")
-_TEXT_OR_DURATION = re.compile(
-    r"""'(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*"|(?<![\w.])(?P<duration>\d+(?:\.\d+)?(?:ms|s|min|m|h)\b)"""
-)
+_TEXT = r"'(?:\\.|[^'\\])*'" + r'|"(?:\\.|[^"\\])*"'
+_TEXT_OR_DURATION = re.compile(_TEXT + r"|(?<![\w.])(?P<duration>\d+(?:\.\d+)?(?:ms|s|min|m|h)\b)")
 
 
 class Rule(NamedTuple):
@@ -74,7 +73,8 @@ def parse_trigger(when: str) -> Rule:
     """Parse a trigger's condition; raises `ExpressionError`, which shows the place."""
     text = expression.one_line(when)
     condition, for_us = text, 0
-    if found := _FOR.search(text):
+    # Texts may have the word, too.
+    if found := _FOR.search(re.sub(_TEXT, lambda quoted: "_" * len(quoted.group()), text)):
         condition = text[: found.start()].rstrip()
         for_us = _duration_us(found.group(1), text, found.start(1), _MAX_SPAN_US)
     reader = _RuleReader(condition)

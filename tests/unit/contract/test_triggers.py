@@ -187,6 +187,9 @@ def test_durations_within_texts_are_texts() -> None:
     assert rule.fields == ("frame", "note", "x1s")
     assert rule.deltas == {"delta(x1s, 1.5s)": ("x1s", 1_500 * MS)}
     assert rule.for_us == 0
+    assert parse_trigger("note == 'wait for 2s'").for_us == 0
+    waits = parse_trigger("note == 'wait for me' and x for 1.5s")
+    assert (waits.fields, waits.for_us) == (("note", "x"), 1_500 * MS)
     assert parse_trigger("silent(front-cam, 1min)").silences == {
         "silent(front-cam, 1min)": ("front-cam", 60 * S)
     }
