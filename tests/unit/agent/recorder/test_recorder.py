@@ -165,13 +165,15 @@ def play(emit: Emit, stop: threading.Event) -> None:
     clock, i = SystemClock(), 0
     while not clock.wait(stop, 0.02):
         now_us = clock.now_us()
-        emit("vesc", now_us, {"current_input": -20.0 if i == 50 else 0.0})
+        emit("vesc", now_us, {"current_input": -20.0 if i == 50 and brakes.is_set() else 0.0})
         sent.append(cdr(f"message {i}"))
         emit("chatter", now_us, RosMessage(sent[-1], TEXT))
         i += 1
 
 
 sent: list[bytes] = []
+# Whether the car brakes hard after a second.
+brakes = threading.Event()
 RUNS: dict[Agent, tuple[Runtime, threading.Thread]] = {}
 
 
@@ -190,6 +192,7 @@ def running(tmp_path: Path) -> Iterator[Callable[..., Agent]]:
 
     def run(**settings: Any) -> Agent:
         sent.clear()
+        brakes.set()
         config = Config("car1", "host", Path(), Path(), (Script(play, "vesc", "chatter"),))
         config = replace(
             config, recorder=RecorderConfig(folder=tmp_path / "ring", keep_free_mb=0, **settings)
@@ -243,10 +246,11 @@ def test_others_open_the_incident_of_a_running_agent(running: Callable[..., Agen
 
 def test_a_window_begins_in_the_run_before(running: Callable[..., Agent], tmp_path: Path) -> None:
     first = running()
+    brakes.clear()
     assert first.recorder is not None
     first.recorder.want(Wanted({"hardbrake": {**BRAKE, "before_s": 60.0, "after_s": 0.1}}, {}))
     folder = tmp_path / "ring" / "incidents"
-    until(lambda: len(sent) > 20, within_s=30.0)
+    until(lambda: first.recorder is not None and first.recorder.answers, within_s=30.0)
     before = end(first)
     running()
     until(lambda: list(folder.glob("*.mcap")), within_s=30.0)
