@@ -34,8 +34,7 @@ from iort_station.data import findings
 from iort_station.data.runs import laps_of_runs, runs
 from iort_station.fleet import robots
 from iort_station.kept import CLOUD
-from iort_station.page.answers import actions, answers, keyed_actions
-from iort_station.page.history import downloads
+from iort_station.page.answers import actions, answers, downloads, keyed_actions
 from iort_station.page.server import PageServer
 from iort_station.times import iso
 from local.cloud import EmbeddedCloud

@@ -37,8 +37,7 @@ from iort_station.fleet import robots
 from iort_station.fleet.viewing import Viewer
 from iort_station.operations import audit
 from iort_station.page import answers as control
-from iort_station.page.answers import actions, answers
-from iort_station.page.history import downloads
+from iort_station.page.answers import actions, answers, downloads
 from iort_station.page.listening import listening
 from iort_station.page.live import Listening
 from iort_station.page.motion import reaching

@@ -30,8 +30,7 @@ from iort_station.cloud import EMBEDDED_VARIABLE, Cloud
 from iort_station.errors import StationError
 from iort_station.output import write_private
 from iort_station.page import answers as control
-from iort_station.page.answers import actions, answers
-from iort_station.page.history import downloads
+from iort_station.page.answers import actions, answers, downloads
 from iort_station.page.motion import reaching
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud

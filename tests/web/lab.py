@@ -159,6 +159,26 @@ SETTINGS = [
 ]
 
 
+def incident(number, state, **given):
+    """The incidents of the last minute, the newest is number 1."""
+    from_us = round(NOW_S - 10 - 15 * number) * 1_000_000
+    return {
+        "id": f"{number:016x}",
+        "robot": "car-1",
+        "from_us": from_us,
+        "to_us": from_us + 10_000_000,
+        "trigger": "hardbrake",
+        "state": state,
+        "condition": "current_input < -15 and speed_mps > 2",
+        "why": "",
+        "by": "",
+        "bytes": 0,
+        "messages": 0,
+        "missing": 0,
+        **given,
+    }
+
+
 LIMITS = {"command": "drive", "speed": "drive.speed", "steering": "drive.steering_angle"}
 LIMITS |= {"max_speed_mps": 2.0, "max_steering_rad": 0.4, "lease_ms": 500}
 
@@ -177,6 +197,12 @@ class Lab:
         self.alone = set()
         # The cars without a command that moves them, which reject a stop.
         self.unstoppable = set()
+        self.incidents = [
+            incident(1, "uploaded", bytes=12_300_000, messages=4_321, missing=3),
+            incident(2, "kept", trigger="take", by="operator@lab", why="hit the kerb"),
+            incident(3, "over_budget", why="hardbrake has spent its 500 MB of the day"),
+        ]
+        self.keeps = {"accepted": True, "reason": "", "online": True}
         self.notes = []
         self.write({"robot": "car-1", "text": "changed the left front tyre"})
         self.alarms = [
@@ -195,6 +221,26 @@ class Lab:
         low, high = (int(asked.get(name, 0)) for name in ("from_us", "to_us"))
         return {"notes": [one for one in self.notes if low <= one["t_us"] < (high or math.inf)]}
 
+    def answer_incidents(self, asked):
+        low, high = int(asked["from_us"]), int(asked.get("to_us", 2**53))
+        found = [one for one in self.incidents if one["to_us"] >= low and one["from_us"] < high]
+        return {"incidents": found, "found": len(found)}
+
+    def keep(self, asked):
+        self.asked.append(dict(asked))
+        if self.keeps["accepted"]:
+            now_us = time.time_ns() // 1000
+            taken = incident(9, "kept", trigger="take", from_us=now_us - 60_000_000, to_us=now_us)
+            self.incidents = [taken, *self.incidents]
+        return self.keeps
+
+    def download(self, asked, folder):
+        if self.refuses:
+            raise StationError("the file is not in the bucket any more")
+        path = folder / f"hardbrake-{asked['id']}.mcap"
+        path.write_bytes(b"messages")
+        return path
+
     def acknowledge(self, asked):
         self.asked.append(dict(asked))
         seen = {"by": asked["by"] or "operator@lab", "at_s": time.time()}
@@ -202,6 +248,8 @@ class Lab:
         return seen
 
     def write(self, asked):
+        if "keep_s" in asked:
+            self.asked.append(dict(asked))
         t_us = int(asked.get("t_us") or time.time_ns() // 1000)
         note = {"robot": asked["robot"], "t_us": t_us, "text": asked["text"], "by": "operator@lab"}
         self.notes.append({"id": f"{t_us:016d}-{len(self.notes):08x}", **note})
@@ -250,11 +298,13 @@ class Lab:
             "vehicles": {"car-1": {"speed_to_erpm_gain": GAIN}},
             "answers": self.answers(),
             "open_actions": {"acknowledge": self.acknowledge},
+            "downloads": {"incident.mcap": self.download},
             "actions": {
                 "send": lambda _: {"accepted": False, "reason": "stale", "after_ms": 300},
                 "analyse": lambda _: {"run": "iort-1"},
                 "note": self.write,
                 "delete_note": self.delete,
+                "keep": self.keep,
                 "stop": self.stop,
                 "drive": self.drive,
                 "settings": lambda _: {"settings": SETTINGS, "online": False},
@@ -272,6 +322,8 @@ class Lab:
             "history": history,
             "insights": insights,
             "notes": self.answer_notes,
+            "incidents": self.answer_incidents,
+            "incident_counts": lambda _: {"counts": {"car-1": len(self.incidents), "car-9": 1}},
             "motion": self.motion,
             "laps": of_laps(analysis.laps),
             "delta": of_laps(analysis.delta),

@@ -1,4 +1,5 @@
-"""The messages to the live page about the analysis: findings, drives, laps, and people's notes beside them.
+"""The messages to the live page about what happened: findings, drives and laps of the analysis, people's
+notes, and incidents of the event recorder.
 
 They are sent as in `page`."""
 
@@ -88,6 +89,43 @@ class NotesAnswer(TypedDict):
     """Answers ``notes``, ``note`` and ``delete_note``: notes about a robot or the fleet, the newest first."""
 
     notes: list[NoteEntry]
+
+
+class IncidentEntry(Extent):
+    """What a robot's recorder has kept of a time: `iort_contract.messages.recorder.Incident` in its newest
+    state. Its file can be downloaded once ``state`` is "uploaded"."""
+
+    id: str
+    robot: str
+    trigger: str
+    state: str
+    condition: str
+    why: str
+    by: str
+    bytes: int
+    messages: int
+    missing: int
+
+
+class IncidentsAnswer(TypedDict):
+    """Answers ``incidents``: those of a robot, the newest first; ``found`` may exceed their number."""
+
+    incidents: list[IncidentEntry]
+    found: int
+
+
+class IncidentCounts(TypedDict):
+    """Answers ``incident_counts``: how many incidents of the last day each robot has, if it has any."""
+
+    counts: dict[str, int]
+
+
+class KeepAnswer(TypedDict):
+    """Answers ``keep``: the robot's answer; null if it did not give one. ``reason`` says why it refused."""
+
+    accepted: bool | None
+    reason: str
+    online: bool
 
 
 class AnalysisStarted(TypedDict):

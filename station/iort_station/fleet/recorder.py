@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from iort_contract.topics import ACCEPTED
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError, unknown
 from iort_station.fleet import registry
-from iort_station.fleet.control import Shadow, State, read
+from iort_station.fleet.control import Shadow, State, read, slept
 
 # Others may change the shadow at the same time; each time one of them has done.
 _TRIES = 20
@@ -94,7 +94,8 @@ def add(cloud: Cloud, robot: str, trigger: Trigger, seconds: float, *, withdraw:
         return messages.encode_trigger(trigger)
 
     _change(shadow, change)
-    answer = _answer(shadow, cloud, trigger.name, seconds, old.reported.recorder.get(trigger.name, ""))
+    before = old.reported.recorder.get(trigger.name, "")
+    answer = slept(_answering(shadow, cloud, trigger.name, seconds, before))
     if withdraw and answer.refused:
         _change(shadow, lambda _: _restored(old, trigger.name))
     return answer
@@ -150,10 +151,17 @@ def take(
 
 def take_answer(cloud: Cloud, robot: str, taken: Take, seconds: float) -> Answer:
     """Wait for the robot's answer to a take."""
-    return _answer(Shadow(cloud, robot), cloud, taken.id, seconds)
+    return slept(take_answering(cloud, robot, taken, seconds))
 
 
-def _answer(shadow: Shadow, cloud: Cloud, name: str, seconds: float, old: str = "") -> Answer:
+def take_answering(cloud: Cloud, robot: str, taken: Take, seconds: float) -> Generator[None, None, Answer]:
+    """As `take_answer`; it yields where that sleeps."""
+    return _answering(Shadow(cloud, robot), cloud, taken.id, seconds)
+
+
+def _answering(
+    shadow: Shadow, cloud: Cloud, name: str, seconds: float, old: str = ""
+) -> Generator[None, None, Answer]:
     online = bool(registry.get(cloud, shadow.robot).get(ONLINE))
     same_from = time.monotonic() + _SAME_S
 
@@ -161,7 +169,7 @@ def _answer(shadow: Shadow, cloud: Cloud, name: str, seconds: float, old: str = 
         text = state.reported.recorder.get(name, "")
         return text if text and (text != old or time.monotonic() >= same_from) else None
 
-    found = shadow.wait(answered, seconds if online else min(seconds, _OFFLINE_S))
+    found = yield from shadow.waiting(answered, seconds if online else min(seconds, _OFFLINE_S))
     return Answer(found or "", online)
 
 

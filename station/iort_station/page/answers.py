@@ -1,4 +1,4 @@
-"""Every answer and action of the live page's server, by its name.
+"""Every answer, action and download of the live page's server, by its name.
 
 Each is a function of the request's parameters; its type is in `iort_contract.messages.page`.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Generator, Mapping
+from functools import partial
 from typing import Any
 
 from iort_contract.cloud import DRIVER, VIEWER
@@ -23,9 +24,10 @@ from iort_station.fleet import control, registry, robots
 from iort_station.fleet.control import Shadow, State
 from iort_station.fleet.roles import has_drivers
 from iort_station.operations import alarms, cloudwatch
-from iort_station.page import history, insights, motion
+from iort_station.page import history, incidents, insights, motion
 from iort_station.page.page import DRIVE
 from iort_station.page.requests import Handler, robot_of, text, whole
+from iort_station.page.server import Download
 
 # A viewer waits for a robot's answer.
 _ANSWER_S = 10.0
@@ -58,6 +60,8 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "laps": lambda request: insights.laps(cloud, request),
         "delta": lambda request: insights.delta(cloud, request),
         "notes": lambda request: insights.notes(cloud, request),
+        "incidents": lambda request: incidents.incidents(cloud, request),
+        "incident_counts": lambda _request: incidents.counts(cloud),
         "motion": motion.fleet(cloud).motion,
         "socket": lambda _request: motion.address(cloud, VIEWER),
     }
@@ -82,9 +86,15 @@ def keyed_actions(cloud: Cloud) -> dict[str, Handler]:
         "analyse": lambda request: insights.analyse(cloud, request),
         "note": lambda request: insights.write_note(cloud, request),
         "delete_note": lambda request: insights.remove_note(cloud, request),
+        "keep": lambda request: incidents.keep(cloud, request),
         "stop": motion.fleet(cloud).stop,
         **({DRIVE: lambda _request: motion.address(cloud, DRIVER)} if has_drivers(cloud) else {}),
     }
+
+
+def downloads(cloud: Cloud) -> dict[str, Download]:
+    """Every file, by its name."""
+    return {**history.downloads(cloud), "incident.mcap": partial(incidents.download, cloud)}
 
 
 def send(cloud: Cloud, request: Mapping[str, str]) -> Generator[None, None, SendAnswer]:

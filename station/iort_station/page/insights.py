@@ -17,6 +17,7 @@ from iort_analysis.samples.blocks import Column
 from iort_contract.catalog.analysis import ANALYSIS_FAILED, GROUPS, KINDS, LAPS_TABLE, PLACES_TABLE
 from iort_contract.messages import insights as messages
 from iort_contract.messages.analysis import AnalysedDrive, AnalysisRequest, Estimate, Finding
+from iort_contract.messages.recorder import MAX_SPAN_S
 from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.data import findings as stored
@@ -220,10 +221,12 @@ def notes(cloud: Cloud, request: Mapping[str, str]) -> messages.NotesAnswer:
 
 
 def write_note(cloud: Cloud, request: Mapping[str, str]) -> messages.NotesAnswer:
-    """Write a note with ``text`` about ``robot`` at ``t_us``, or about now."""
+    """Write a note with ``text`` about ``robot`` at ``t_us``, or about now; its recorder keeps the ``keep_s``
+    before that time, if they are given."""
     robot = text(request, "robot")
     t_us = whole(request, "t_us", 0, 2**53) if "t_us" in request else None
-    stored.write_note(cloud, robot, text(request, "text"), by=user(), t_us=t_us)
+    keep_us = whole(request, "keep_s", 1, round(MAX_SPAN_S)) * 1_000_000 if "keep_s" in request else 0
+    stored.write_note(cloud, robot, text(request, "text"), by=user(), t_us=t_us, keep_us=keep_us)
     return notes(cloud, {"robot": robot})
 
 

@@ -339,10 +339,10 @@ def test_times_are_typed_with_24_hours(open_page, any_past):
     page.locator(VIEWS["history"].filled).first.wait_for()
     page.fill("#from", "2026-05-04 14:00:00")
     page.fill("#to", "3 PM")
-    page.get_by_role("button", name="Load").click()
+    page.get_by_role("button", name="Load", exact=True).click()
     page.get_by_text('to must be a date and a time like 2026-05-04 14:03:27, got "3 PM".').wait_for()
     page.fill("#to", "2026-05-04 15:00:00")
-    page.get_by_role("button", name="Load").click()
+    page.get_by_role("button", name="Load", exact=True).click()
     until(lambda: "from=2026-05-04T14:00:00.000Z&to=2026-05-04T15:00:00.000Z" in page.url, "the range")
 
 

@@ -42,7 +42,6 @@ def dashboard(
     # numpy and aiohttp take longer to load than most commands to run.
     from iort_station.page import answers as control  # noqa: PLC0415 - as above
     from iort_station.page.answers import actions, answers  # noqa: PLC0415 - see above
-    from iort_station.page.history import downloads  # noqa: PLC0415 - as above
     from iort_station.page.motion import reaching  # noqa: PLC0415 - as above
     from iort_station.page.page import load_track  # noqa: PLC0415 - as above
     from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
@@ -52,7 +51,7 @@ def dashboard(
         namespace=cloud.namespace,
         token=token,
         answers=answers(cloud),
-        downloads=downloads(cloud),
+        downloads=control.downloads(cloud),
         open_actions=actions(cloud),
         # Only people at this machine may move a robot.
         actions=control.keyed_actions(cloud) if on_loopback(host) else {},

@@ -302,6 +302,40 @@ export interface NotesAnswer {
   readonly notes: readonly NoteEntry[];
 }
 
+/** What a robot's recorder has kept of a time: `iort_contract.messages.recorder.Incident` in its newest state. Its file can be downloaded once ``state`` is "uploaded". */
+export interface IncidentEntry {
+  readonly from_us: number;
+  readonly to_us: number;
+  readonly id: string;
+  readonly robot: string;
+  readonly trigger: string;
+  readonly state: string;
+  readonly condition: string;
+  readonly why: string;
+  readonly by: string;
+  readonly bytes: number;
+  readonly messages: number;
+  readonly missing: number;
+}
+
+/** Answers ``incidents``: those of a robot, the newest first; ``found`` may exceed their number. */
+export interface IncidentsAnswer {
+  readonly incidents: readonly IncidentEntry[];
+  readonly found: number;
+}
+
+/** Answers ``incident_counts``: how many incidents of the last day each robot has, if it has any. */
+export interface IncidentCounts {
+  readonly counts: Readonly<Record<string, number>>;
+}
+
+/** Answers ``keep``: the robot's answer; null if it did not give one. ``reason`` says why it refused. */
+export interface KeepAnswer {
+  readonly accepted: boolean | null;
+  readonly reason: string;
+  readonly online: boolean;
+}
+
 /** Answers ``analyse``: the run of the analysis. */
 export interface AnalysisStarted {
   readonly run: string;

@@ -18,10 +18,11 @@ export interface Curve {
   readonly points?: boolean;
 }
 
-/** A place on the x axis with a short label. */
+/** A place on the x axis with a short label, or all from there to another place. */
 export interface Mark {
   readonly at: number;
   readonly label: string;
+  readonly to?: number;
 }
 
 /** What a viewer does on a chart. Without it the chart only has a cursor. */
@@ -231,9 +232,14 @@ export class RangeChart {
     ctx.font = `600 ${Math.round(size * 0.9)}px ${getComputedStyle(document.body).fontFamily}`;
     ctx.textAlign = "center";
     ctx.textBaseline = "top";
-    for (const { at, label } of this.marks) {
-      const x = Math.round(valToPos(at, "x", true));
-      if (x < bbox.left || x > bbox.left + bbox.width) continue;
+    const right = bbox.left + bbox.width;
+    for (const { at, label, to = at } of this.marks) {
+      const [begin, end] = [valToPos(at, "x", true), valToPos(to, "x", true)];
+      if (end < bbox.left || begin > right) continue;
+      // What begins before the range has its label at the range's start.
+      const x = Math.max(bbox.left, Math.round(begin));
+      ctx.fillStyle = faint(this.marked.line, 0.14);
+      ctx.fillRect(x, bbox.top, Math.min(end, right) - x, bbox.height);
       ctx.fillStyle = this.marked.line;
       ctx.fillRect(x, bbox.top, Math.max(1, devicePixelRatio), bbox.height);
       const width = ctx.measureText(label).width + size * 0.6;

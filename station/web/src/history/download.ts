@@ -1,8 +1,8 @@
 // Saves a range as a file of one of the server's formats.
 
 import { button, el, Text } from "../base/dom";
-import { bytes } from "../live/attachments";
-import { download, Latest } from "../server/answers";
+import { Latest } from "../server/answers";
+import { save } from "../widgets/saving";
 
 const FORMATS = { csv: "CSV", parquet: "Parquet", mcap: "MCAP" } as const;
 
@@ -15,24 +15,13 @@ export class Download {
   constructor(private readonly asked: () => Readonly<Record<string, string>>) {
     const buttons = Object.entries(FORMATS).map(([format, label]) => {
       const title = `Every field and sample of the range, as ${label}`;
-      return button(label, () => void this.save(format), { title });
+      return button(label, () => this.save(format), { title });
     });
     this.node = el("p", { class: "download" }, "Download ", ...buttons, this.note.node);
   }
 
-  private async save(format: string): Promise<void> {
+  private save(format: string): void {
     this.note.set("Reading the samples …");
-    const received = (size: number): void => this.note.set(`${bytes(size)} …`);
-    await this.loading.run(
-      async (signal) => {
-        const { content, name } = await download(`history.${format}`, this.asked(), received, signal);
-        const address = URL.createObjectURL(content);
-        el("a", { href: address, download: name }).click();
-        // The browser takes its own hold of the content when it begins to save it.
-        window.setTimeout(() => URL.revokeObjectURL(address), 60_000);
-        this.note.set(`${name}, ${bytes(content.size)}`);
-      },
-      (reason) => this.note.set(reason),
-    );
+    void save(`history.${format}`, this.asked(), this.note, this.loading);
   }
 }

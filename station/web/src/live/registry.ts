@@ -1,6 +1,6 @@
-// The registered cars, asked from the page's server while somebody looks; a static site knows only the cars that it hears.
+// The registered cars and their incidents of a day, asked from the page's server while somebody looks; a static site knows only the cars that it hears.
 
-import type { Config, RobotPresence, RobotsAnswer, TagsAnswer } from "../base/contract";
+import type { Config, IncidentCounts, RobotPresence, RobotsAnswer, TagsAnswer } from "../base/contract";
 import { AnswerError, ask } from "../server/answers";
 
 const REFRESH_S = 30;
@@ -9,6 +9,7 @@ export class Registry {
   /** Undefined until the server has answered. */
   robots: RobotsAnswer["robots"] | undefined;
   tags: TagsAnswer["tags"] = {};
+  private incidents: IncidentCounts["counts"] = {};
   /** Grows with every answer. */
   version = 0;
   private timer: number | undefined;
@@ -21,8 +22,8 @@ export class Registry {
     window.clearInterval(this.timer);
     this.timer = undefined;
     if (!needed) return;
-    void this.find();
-    this.timer = window.setInterval(() => !document.hidden && void this.find(), REFRESH_S * 1000);
+    this.refresh();
+    this.timer = window.setInterval(() => !document.hidden && this.refresh(), REFRESH_S * 1000);
   }
 
   presence(robot: string): RobotPresence | undefined {
@@ -31,6 +32,22 @@ export class Registry {
 
   tag(robot: string, name: string): string | undefined {
     return Object.hasOwn(this.tags, robot) ? this.tags[robot]![name] : undefined;
+  }
+
+  /** How many incidents of the last day a car has. */
+  incidentsOf(robot: string): number {
+    return Object.hasOwn(this.incidents, robot) ? this.incidents[robot]! : 0;
+  }
+
+  private refresh(): void {
+    void this.find();
+    // They are counted from the samples of every car, which takes longer.
+    void ask<IncidentCounts>("incident_counts", {}).then(
+      ({ counts }) => (this.incidents = counts),
+      (error: unknown) => {
+        if (!(error instanceof AnswerError)) throw error;
+      },
+    );
   }
 
   private async find(): Promise<void> {

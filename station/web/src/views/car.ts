@@ -22,6 +22,7 @@ import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
 import { may } from "../server/admission";
+import { IncidentsPanel } from "../widgets/incidents_panel";
 import { NotesPanel } from "../widgets/notes_panel";
 import type { Speed } from "../widgets/status_bar";
 import type { Services, View } from "./view";
@@ -45,6 +46,7 @@ export class CarView implements View<RouteTo<"car">> {
   private readonly commands = new Commands();
   private readonly settings = new Settings();
   private readonly log: AgentLog;
+  private readonly incidents: IncidentsPanel;
   private readonly notes: NotesPanel;
   private readonly streams = el("div", { class: "streams" });
   private readonly waterfall: Waterfall;
@@ -62,7 +64,8 @@ export class CarView implements View<RouteTo<"car">> {
     this.past = new Past(config);
     this.waterfall = new Waterfall(config);
     this.log = new AgentLog(config);
-    this.notes = new NotesPanel(config);
+    this.incidents = new IncidentsPanel(config);
+    this.notes = new NotesPanel(config, { kept: () => this.incidents.expect() });
     this.gauges = GAUGES.map((each) => new Gauge(each));
     this.gaugeRow.append(...this.gauges.map(({ node }) => node));
     this.board = new Board(table, config.track, () => this.tools.arranged());
@@ -89,6 +92,7 @@ export class CarView implements View<RouteTo<"car">> {
           this.waterfall.node,
           this.faults.node,
           this.log.node,
+          this.incidents.node,
           this.notes.node,
           ...(may(config, "send") ? [this.commands.node, this.settings.node] : []),
         ),
@@ -116,6 +120,7 @@ export class CarView implements View<RouteTo<"car">> {
   }
 
   leave(): void {
+    this.incidents.stop();
     this.services.fleet.watch(undefined);
     this.past.fill(undefined, 0);
     this.hear(undefined);
@@ -126,6 +131,7 @@ export class CarView implements View<RouteTo<"car">> {
     this.commands.of(name);
     this.settings.of(name);
     this.log.of(name);
+    this.incidents.show(name);
     void this.notes.show(name);
     this.tools.read(query);
     this.drawn = -1;

@@ -55,7 +55,7 @@ export class FleetView implements View<RouteTo<"fleet">> {
     const { config, table, registry, stops } = services;
     this.stops = stops.stops;
     this.tools = new FleetTools(registry, table, () => (this.placedAt = -Infinity));
-    this.offline = new OfflineCars(config);
+    this.offline = new OfflineCars(config, registry);
     this.node = el("div", { class: "fleet" }, this.tools.node, this.nothing, this.nav, this.offline.node);
   }
 
@@ -86,6 +86,7 @@ export class FleetView implements View<RouteTo<"fleet">> {
     }
     const held = this.nav.matches(":hover, :focus-within") && this.placedAt > -Infinity;
     if (now - this.placedAt >= PLACE_S && !held) this.place(now);
+    const { fleet, table, registry } = this.services;
     this.refresh = () => {
       for (const name of this.seen) {
         const robot = this.services.fleet.robots.get(name);
@@ -94,7 +95,7 @@ export class FleetView implements View<RouteTo<"fleet">> {
             .get(name)
             ?.update(
               robot,
-              { fleet: this.services.fleet, table: this.services.table, stop: this.stops.word(name) },
+              { fleet, table, stop: this.stops.word(name), incidents: registry.incidentsOf(name) },
               now,
               linked,
             );

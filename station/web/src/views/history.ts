@@ -5,12 +5,14 @@ import { el, Text, unserved } from "../base/dom";
 import { age, number, when } from "../base/format";
 import { inUs, LEAST_S, type Range, readRange, readTime, rounded, same, writeTime } from "../base/range";
 import { type Query, type RouteTo, route, setAddress } from "../base/route";
+import type { Mark } from "../charts/range_chart";
 import { fromArchive, unread } from "../history/origin";
 import { RangeForm } from "../history/range_form";
 import { Result } from "../history/result";
 import { RunsList } from "../history/runs_list";
 import { GLANCE_HZ, type Looks } from "../link/viewing";
 import { ask, Latest, words } from "../server/answers";
+import { IncidentsPanel, letter } from "../widgets/incidents_panel";
 import { NotesPanel } from "../widgets/notes_panel";
 import { type Services, type View, viewNode } from "./view";
 
@@ -34,6 +36,12 @@ export class HistoryView implements View<RouteTo<"history">> {
   private readonly runs = new RunsList((before_us) => void this.findRuns(before_us));
   private readonly result: Result;
   private readonly notes: NotesPanel;
+  private readonly incidents: IncidentsPanel;
+  /** People's notes have numbers, incidents have letters. */
+  private marks: { readonly notes: readonly Mark[]; readonly incidents: readonly Mark[] } = {
+    notes: [],
+    incidents: [],
+  };
   private robot = "";
   private range: Range | undefined;
   /** The ranges from which the viewer zoomed in. */
@@ -62,7 +70,17 @@ export class HistoryView implements View<RouteTo<"history">> {
     this.notes = new NotesPanel(config, {
       at: () => (Number.isNaN(this.result.at) ? Math.min(this.range![1], Date.now() / 1000) : this.result.at),
       shown: (notes) =>
-        this.result.mark(notes.map(({ t_us }, i) => ({ at: t_us / 1e6, label: String(i + 1) }))),
+        this.mark({ notes: notes.map(({ t_us }, i) => ({ at: t_us / 1e6, label: String(i + 1) })) }),
+    });
+    this.incidents = new IncidentsPanel(config, {
+      shown: (incidents) =>
+        this.mark({
+          incidents: incidents.map(({ from_us, to_us }, i) => ({
+            at: from_us / 1e6,
+            to: to_us / 1e6,
+            label: letter(i),
+          })),
+        }),
     });
     const served = [
       this.form.node,
@@ -70,6 +88,7 @@ export class HistoryView implements View<RouteTo<"history">> {
       el("div", { class: "history-status" }, this.note.node, this.form.out),
       this.result.node,
       this.notes.node,
+      this.incidents.node,
     ];
     const beside = [
       el("p", { class: "car-state" }, "history"),
@@ -94,6 +113,7 @@ export class HistoryView implements View<RouteTo<"history">> {
   leave(): void {
     this.result.stop();
     this.loading.stop();
+    this.incidents.stop();
   }
 
   show({ robot, query = {} }: RouteTo<"history">): void {
@@ -113,6 +133,11 @@ export class HistoryView implements View<RouteTo<"history">> {
     this.runs.set(robot, undefined);
     this.form.node.inert = true;
     if (this.services.config.answers) void this.enter(robot, query);
+  }
+
+  private mark(changed: Partial<typeof this.marks>): void {
+    this.marks = { ...this.marks, ...changed };
+    this.result.mark([...this.marks.incidents, ...this.marks.notes]);
   }
 
   clock(): void {
@@ -261,6 +286,7 @@ export class HistoryView implements View<RouteTo<"history">> {
 
   private async load(range: Range): Promise<void> {
     void this.notes.show(this.robot, range);
+    this.incidents.show(this.robot, range);
     this.note.set("Loading …");
     const began = performance.now();
     await this.loading.run(

@@ -9,11 +9,13 @@ import type { Word } from "../drive/stops";
 import type { Fleet } from "../live/fleet";
 import { hottest, type Robot } from "../live/robot";
 import { CARD_FIELD, numeric } from "../live/stream";
+import { IncidentsBadge } from "./incidents_badge";
 
 export class Card {
   readonly node: HTMLElement;
   private readonly state = new Text("card-state");
   private readonly stop = new Text("card-stop");
+  private readonly incidents = new IncidentsBadge();
   private inside: Inside | undefined;
 
   constructor(readonly name: string) {
@@ -25,6 +27,7 @@ export class Card {
         { class: "card-head" },
         el("span", { class: "dot", "aria-hidden": "true" }),
         el("span", { class: "card-name" }, name),
+        this.incidents.node,
         this.state.node,
       ),
     );
@@ -32,7 +35,18 @@ export class Card {
 
   update(
     robot: Robot,
-    { fleet, table, stop }: { readonly fleet: Fleet; readonly table: FieldTable; readonly stop: Word },
+    {
+      fleet,
+      table,
+      stop,
+      incidents,
+    }: {
+      readonly fleet: Fleet;
+      readonly table: FieldTable;
+      readonly stop: Word;
+      /** How many the last day had. */
+      readonly incidents: number;
+    },
     now: number,
     linked: boolean,
   ): void {
@@ -50,6 +64,7 @@ export class Card {
         : { live: "online", idle: "idle", stale: "stale", gone: "gone", unlinked: "no link" }[shown],
     );
     setAttribute(this.node, "data-fault", String(robot.fault(table) !== undefined));
+    this.incidents.set(incidents);
     setAttribute(this.node, "data-stop", stop.kind);
     this.stop.set(
       {

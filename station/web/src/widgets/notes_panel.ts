@@ -7,6 +7,7 @@ import { inUs, type Range, writeTime } from "../base/range";
 import { route } from "../base/route";
 import { may } from "../server/admission";
 import { act, ask, Latest, words } from "../server/answers";
+import { KEEP_S } from "./incidents_panel";
 
 /** The history around a note, in seconds before and after it. */
 const AROUND_S = 30;
@@ -16,6 +17,8 @@ export interface NotesOptions {
   readonly at?: () => number;
   /** Other notes are shown, the oldest first. A list's number is the place here, from 1. */
   readonly shown?: (notes: readonly NoteEntry[]) => void;
+  /** The car is to keep what was before a note. */
+  readonly kept?: () => void;
 }
 
 export class NotesPanel {
@@ -30,6 +33,7 @@ export class NotesPanel {
     autocomplete: "off",
     "aria-label": "Note",
   });
+  private readonly keep = el("input", { type: "checkbox", name: "keep" });
   private readonly form: HTMLElement;
   private robot: string | undefined;
   private range: Range | undefined;
@@ -41,7 +45,9 @@ export class NotesPanel {
   ) {
     this.text.placeholder = options.at ? "What happened at this time?" : "What happened?";
     const add = el("button", { type: "submit", class: "tool" }, "Add note");
-    this.form = form({ class: "range note-form" }, () => void this.write(), this.text, add);
+    const title = "Upload what the car's recorder has of the time before it";
+    const keep = may(config, "keep") ? [el("label", { title }, this.keep, ` Keep ${KEEP_S} s`)] : [];
+    this.form = form({ class: "range note-form" }, () => void this.write(), this.text, ...keep, add);
     this.node = panel("Notes", "notes", [], this.list, this.form, this.said);
   }
 
@@ -68,14 +74,23 @@ export class NotesPanel {
   private async write(): Promise<void> {
     const { robot } = this;
     const time = this.options.at ? { t_us: String(Math.round(this.options.at() * 1e6)) } : {};
+    const keep: Readonly<Record<string, string>> = this.keep.checked ? { keep_s: String(KEEP_S) } : {};
     this.say("", "Writing …");
     try {
-      await act<NotesAnswer>("note", { robot: robot!, text: this.text.value, ...time });
+      await act<NotesAnswer>("note", { robot: robot!, text: this.text.value, ...time, ...keep });
       this.text.value = "";
       if (robot === this.robot) await this.load();
+      if (robot === this.robot && this.keep.checked) this.kept();
     } catch (error) {
       this.say("bad", words(error));
     }
+  }
+
+  /** The box is for one note. */
+  private kept(): void {
+    this.keep.checked = false;
+    this.say("", `${this.robot} is to keep the ${KEEP_S} s before it: they come under Incidents.`);
+    this.options.kept?.();
   }
 
   private async remove({ robot, id }: NoteEntry): Promise<void> {

@@ -4,7 +4,9 @@ import type { Config, RobotPresence } from "../base/contract";
 import { el, Text } from "../base/dom";
 import { when } from "../base/format";
 import { route } from "../base/route";
+import type { Registry } from "../live/registry";
 import type { Robot } from "../live/robot";
+import { IncidentsBadge } from "./incidents_badge";
 
 export class OfflineCars {
   readonly node: HTMLDetailsElement;
@@ -13,7 +15,10 @@ export class OfflineCars {
   private drawn = "";
   private chosen = false;
 
-  constructor(private readonly config: Config) {
+  constructor(
+    private readonly config: Config,
+    private readonly registry: Registry,
+  ) {
     const summary = el("summary", {}, this.title.node);
     summary.addEventListener("click", () => (this.chosen = true));
     this.node = el("details", { class: "offline", hidden: "" }, summary, this.list);
@@ -24,7 +29,11 @@ export class OfflineCars {
     if (!this.chosen) this.node.open = alone;
     const rows = cars.map(
       ([name, known]) =>
-        [name, "heardAt" in known ? `last heard ${when(known.heardAt)}` : presence(known)] as const,
+        [
+          name,
+          "heardAt" in known ? `last heard ${when(known.heardAt)}` : presence(known),
+          this.registry.incidentsOf(name),
+        ] as const,
     );
     const drawn = JSON.stringify(rows);
     if (drawn === this.drawn) return;
@@ -33,13 +42,14 @@ export class OfflineCars {
     this.title.set(`Not heard: ${rows.length} ${rows.length === 1 ? "car" : "cars"}`);
     const view = this.config.answers ? "history" : "car";
     this.list.replaceChildren(
-      ...rows.map(([name, text]) =>
+      ...rows.map(([name, text, incidents]) =>
         el(
           "li",
           { "data-absent": name },
           el("a", { href: route({ view, robot: name }), title: `What ${name} did` }, name),
           " ",
           text,
+          ...(incidents > 0 ? [" ", new IncidentsBadge(incidents).node] : []),
         ),
       ),
     );

@@ -1,0 +1,83 @@
+"""What robots' event recorders have kept, for the live page: lists, files, and what a viewer has one keep."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Generator, Mapping
+from pathlib import Path
+
+from iort_contract.messages import insights as messages
+from iort_contract.messages.recorder import MAX_SPAN_S, UPLOADED
+from iort_contract.topics import ACCEPTED
+from iort_station.cloud import Cloud
+from iort_station.data import incidents as stored
+from iort_station.data.incidents import RobotIncident
+from iort_station.errors import StationError
+from iort_station.fleet import files, recorder
+from iort_station.operations.alarms import user
+from iort_station.page.history import MOST_BYTES
+from iort_station.page.requests import robot_of, text, whole
+
+_MOST = 100
+_DAY_US = 86_400_000_000
+# A robot that is connected looks once a second.
+_ANSWER_S = 15.0
+
+
+def incidents(cloud: Cloud, request: Mapping[str, str]) -> messages.IncidentsAnswer:
+    """The newest incidents of ``robot`` with a part in ``from_us`` to ``to_us``; that end is optional."""
+    start_us = whole(request, "from_us", 0, 2**53)
+    end_us = whole(request, "to_us", 0, 2**53) if "to_us" in request else None
+    found = stored.incidents(cloud, robot_of(request), start_us, end_us)
+    return {"incidents": [_entry(one) for one in found[:_MOST]], "found": len(found)}
+
+
+def counts(cloud: Cloud) -> messages.IncidentCounts:
+    """How many incidents of the last day each robot has."""
+    since_us = time.time_ns() // 1000 - _DAY_US
+    return {"counts": dict(Counter(one.robot for one in stored.incidents(cloud, start_us=since_us)))}
+
+
+def keep(cloud: Cloud, request: Mapping[str, str]) -> Generator[None, None, messages.KeepAnswer]:
+    """Have ``robot`` keep the last ``last_s``. It yields while it waits for the robot's answer."""
+    robot, last_s = robot_of(request), whole(request, "last_s", 1, round(MAX_SPAN_S))
+    now_us = time.time_ns() // 1000
+    taken = recorder.take(cloud, robot, now_us - last_s * 1_000_000, now_us, by=user())
+    answer = yield from recorder.take_answering(cloud, robot, taken, _ANSWER_S)
+    accepted = answer.text == ACCEPTED if answer.text else None
+    return {"accepted": accepted, "reason": answer.text if answer.refused else "", "online": answer.online}
+
+
+def download(cloud: Cloud, request: Mapping[str, str], folder: Path) -> Path:
+    """The file of the incident ``id`` of ``robot``, which begins at ``from_us``."""
+    robot, id_, from_us = robot_of(request), text(request, "id"), whole(request, "from_us", 0, 2**53)
+    found = stored.incidents(cloud, robot, from_us, from_us + 1)
+    one = next((one.incident for one in found if one.incident.id == id_), None)
+    if one is None or one.state != UPLOADED:
+        raise StationError(f"{robot} has uploaded no incident {id_[:40]}")
+    if one.bytes > MOST_BYTES:
+        raise StationError(f"it has over {MOST_BYTES:,} bytes: run `iort incidents get {one.id}`")
+    file = files.stored(cloud, one.key)
+    # The robot itself has named the key.
+    if file is None or file.robot != robot:
+        raise StationError(f"the file of {one.id} is not in the bucket any more")
+    return files.download(cloud, file, folder)
+
+
+def _entry(one: RobotIncident) -> messages.IncidentEntry:
+    incident = one.incident
+    return {
+        "id": incident.id,
+        "robot": one.robot,
+        "from_us": incident.from_us,
+        "to_us": incident.to_us,
+        "trigger": incident.trigger,
+        "state": incident.state,
+        "condition": incident.condition,
+        "why": incident.why,
+        "by": incident.by,
+        "bytes": incident.bytes,
+        "messages": incident.messages,
+        "missing": incident.missing,
+    }

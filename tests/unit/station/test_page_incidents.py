@@ -1,0 +1,132 @@
+"""The page's answers about incidents: listed, counted, downloaded, and kept by a button or with a note."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+
+import pytest
+
+from iort_contract.messages.files import File, file_key
+from iort_contract.messages.recorder import KEPT, LOST, UPLOADED, Incident
+from iort_station.data import findings
+from iort_station.errors import StationError, UsageError
+from iort_station.fleet.control import slept
+from iort_station.page import incidents as page
+from iort_station.page import insights
+from iort_station.page.answers import answers, downloads, keyed_actions
+from testkit.dynamodb import FILES
+from tests.unit.station.fleet.test_recorder import START, Lab, S
+
+CONTENT = b"messages"
+
+
+def incident(number: int, state: str = KEPT, start_us: int = START, **more: object) -> Incident:
+    return Incident(f"{number:08x}", "brake", start_us, start_us + 40 * S, state, **more)  # type: ignore[arg-type]  # fields
+
+
+@pytest.fixture
+def lab():
+    return Lab()
+
+
+def test_a_robots_incidents_are_those_of_the_range_in_their_newest_state(lab):
+    lab.tell(incident(1), START)
+    lab.tell(incident(1, LOST, why="the ring has nothing"), START + S)
+    lab.tell(incident(2, start_us=START + 100 * S), START + 100 * S)
+    lab.tell(incident(3), START, robot="van")
+    ask = answers(lab)["incidents"]
+    told = ask({"robot": "car", "from_us": str(START)})
+    assert told["found"] == 2
+    second, first = told["incidents"]
+    assert (second["id"], second["state"]) == ("00000002", KEPT)
+    assert (first["state"], first["why"], first["robot"]) == (LOST, "the ring has nothing", "car")
+    early = ask({"robot": "car", "from_us": str(START), "to_us": str(START + 60 * S)})
+    assert [one["id"] for one in early["incidents"]] == ["00000001"]
+    for wrong in ({"robot": "car"}, {"robot": "", "from_us": "0"}, {"robot": "car", "from_us": "-1"}):
+        with pytest.raises(StationError):
+            ask(wrong)
+
+
+def test_a_list_is_cut_to_the_newest(lab, monkeypatch):
+    monkeypatch.setattr(page, "_MOST", 1)
+    for number in (1, 2):
+        lab.tell(incident(number, start_us=START + number * S), START + number * S)
+    told = page.incidents(lab, {"robot": "car", "from_us": "0"})
+    assert ([one["id"] for one in told["incidents"]], told["found"]) == (["00000002"], 2)
+
+
+def test_the_last_days_incidents_are_counted_by_robot(lab):
+    now_us = time.time_ns() // 1000
+    for number, robot, ago_s in ((1, "car", 60), (2, "car", 7_200), (3, "van", 60), (4, "van", 100_000)):
+        lab.tell(incident(number, start_us=now_us - ago_s * S), now_us - ago_s * S, robot)
+    assert answers(lab)["incident_counts"]({}) == {"counts": {"car": 2, "van": 1}}
+
+
+def test_an_uploaded_incident_is_downloaded_and_checked(lab, s3, tmp_path, monkeypatch):
+    lab.bucket = s3
+    digest = hashlib.sha256(CONTENT).hexdigest()
+    key = file_key("car", File("brake-1.mcap", "recording", "application/x-mcap", 8, digest, START))
+    s3.put_object(Bucket=FILES, Key=key, Body=CONTENT, Metadata={"sha256": digest})
+    lab.tell(incident(1), START)
+    download = downloads(lab)["incident.mcap"]
+    asked = {"robot": "car", "id": "00000001", "from_us": str(START)}
+    with pytest.raises(StationError, match="car has uploaded no incident 00000001"):
+        download(asked, tmp_path)
+    lab.tell(incident(1, UPLOADED, key=key, bytes=8), START + S)
+    path = download(asked, tmp_path)
+    assert (path.name, path.read_bytes()) == ("brake-1.mcap", CONTENT)
+    # A robot names its own files, and no other's.
+    lab.tell(incident(2, UPLOADED, key=key, bytes=8), START, robot="van")
+    with pytest.raises(StationError, match="not in the bucket any more"):
+        download({**asked, "robot": "van", "id": "00000002"}, tmp_path)
+    monkeypatch.setattr(page, "MOST_BYTES", 7)
+    with pytest.raises(StationError, match="over 7 bytes: run `iort incidents get 00000001`"):
+        download(asked, tmp_path)
+    s3.delete_object(Bucket=FILES, Key=key)
+    monkeypatch.undo()
+    with pytest.raises(StationError, match="not in the bucket any more"):
+        download(asked, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("says", "online", "told"),
+    [
+        ("accepted", True, {"accepted": True, "reason": "", "online": True}),
+        ("no recorder", True, {"accepted": False, "reason": "no recorder", "online": True}),
+        ("", True, {"accepted": None, "reason": "", "online": True}),
+        ("", False, {"accepted": None, "reason": "", "online": False}),
+    ],
+)
+def test_the_button_has_a_robot_keep_the_last_seconds_and_tells_its_answer(says, online, told, monkeypatch):
+    monkeypatch.setattr(page, "_ANSWER_S", 0.0)
+    lab = Lab(says, online=online)
+    assert slept(page.keep(lab, {"robot": "car", "last_s": "60"})) == told
+    (taken,) = lab.takes().values()
+    assert taken.to_us - taken.from_us == 60 * S
+    assert taken.by
+
+
+def test_only_what_a_recorder_may_keep_is_taken(lab):
+    for last_s in ("0", "1801", "x"):
+        with pytest.raises(StationError, match="last_s must be a whole number"):
+            slept(page.keep(lab, {"robot": "car", "last_s": last_s}))
+    assert not lab.takes()
+
+
+def test_a_note_may_keep_what_was_before_it(lab, monkeypatch):
+    class Table:
+        def put_note(self, note):
+            self.note = note
+
+    monkeypatch.setattr(findings, "findings_table", lambda _cloud: Table())
+    monkeypatch.setattr(insights, "notes", lambda _cloud, _request: {"notes": []})
+    monkeypatch.setattr("iort_station.page.answers.has_drivers", lambda _cloud: False)
+    write = keyed_actions(lab)["note"]
+    write({"robot": "car", "text": "hit the kerb", "t_us": str(START), "keep_s": "60"})
+    write({"robot": "car", "text": "a plain note"})
+    (taken,) = lab.takes().values()
+    assert (taken.from_us, taken.to_us, taken.why) == (START - 60 * S, START, "hit the kerb")
+    with pytest.raises((StationError, UsageError)):
+        write({"robot": "car", "text": "x", "keep_s": "7200"})
+    assert len(lab.takes()) == 1

@@ -1,0 +1,104 @@
+"""What a car's recorder has kept, in a browser: the list, its files, the button, and marks in the past."""
+
+from __future__ import annotations
+
+from testkit.waiting import until
+from tests.browser import drawn, show
+from tests.web.lab import NOW_S
+
+
+def items(page, view):
+    return page.locator(f".{view} .incidents-list li")
+
+
+def test_incidents_are_listed_in_their_newest_state_and_downloaded(open_page, lab, server, car, tmp_path):
+    page = open_page(server.url + "#/car/car-1", timezone_id="UTC", accept_downloads=True)
+    show(page, car.send())
+    listed = items(page, "car")
+    until(lambda: listed.count() == 3, "the incidents")
+    uploaded, kept, spent = (" ".join(text.split()) for text in listed.all_inner_texts())
+    assert "hardbrake uploaded" in uploaded
+    assert "12.3 MB, 4321 messages, 3 missing" in uploaded
+    assert "take on the car" in kept
+    assert "hit the kerb, by operator@lab" in kept
+    assert "over budget" in spent
+    assert "has spent its 500 MB of the day" in spent
+    # Whoever may only look reads and downloads, and keeps nothing.
+    assert page.get_by_role("button", name="Keep the last 60 s").count() == 0
+    button = page.get_by_role("button", name="Download the incident hardbrake")
+    assert button.count() == 1
+    with page.expect_download() as loading:
+        button.click()
+    loading.value.save_as(tmp_path / "file")
+    assert loading.value.suggested_filename == "hardbrake-0000000000000001.mcap"
+    assert (tmp_path / "file").read_bytes() == b"messages"
+    lab.refuses = True
+    button.click()
+    until(lambda: "not in the bucket any more" in listed.first.inner_text(), "the reason")
+    listed.first.get_by_role("link").click()
+    page.locator(".history .charts canvas").first.wait_for()
+    until(lambda: "hardbrake" in items(page, "history").first.inner_text(), "the incident in the past")
+
+
+def test_the_button_shows_the_cars_answer(open_page, lab, server, car):
+    page = open_page(server.invitation("#/car/car-1"))
+    show(page, car.send())
+    said, button = page.locator(".incidents .said"), page.get_by_role("button", name="Keep the last 60 s")
+    lab.keeps = {"accepted": False, "reason": "no recorder: car.yaml has no section recorder", "online": True}
+    button.click()
+    until(lambda: said.inner_text() == f"car-1 refuses: {lab.keeps['reason']}", "the refusal")
+    lab.keeps = {"accepted": None, "reason": "", "online": False}
+    button.click()
+    until(lambda: "it keeps them when it is back" in said.inner_text(), "the car to be away")
+    lab.keeps["online"] = True
+    button.click()
+    until(lambda: "No answer" in said.inner_text(), "no answer")
+    lab.keeps = {"accepted": True, "reason": "", "online": True}
+    button.click()
+    until(lambda: said.inner_text() == "car-1 keeps them, and uploads them.", "the answer")
+    assert lab.asked == [{"robot": "car-1", "last_s": "60"}] * 4
+    # It is in the list without a reload, and so is its upload.
+    until(lambda: items(page, "car").count() == 4, "what is kept")
+    lab.incidents[0] |= {"state": "uploaded", "bytes": 5_000}
+    until(lambda: "5.0 kB" in items(page, "car").first.inner_text(), "the upload")
+
+
+def test_a_note_may_have_the_car_keep_what_was_before_it(open_page, lab, server, car):
+    page = open_page(server.invitation("#/car/car-1"))
+    show(page, car.send())
+    page.fill("[name=note]", "lost the rear")
+    page.get_by_label("Keep 60 s").check()
+    page.get_by_role("button", name="Add note").click()
+    until(lambda: "is to keep the 60 s before it" in page.inner_text(".notes:not(.incidents) .said"), "it")
+    assert lab.asked == [{"robot": "car-1", "text": "lost the rear", "keep_s": "60"}]
+    assert not page.get_by_label("Keep 60 s").is_checked()
+
+
+def test_the_past_has_marks_where_incidents_are(open_page, lab, server):
+    lab.incidents, incidents = [], lab.incidents
+    page = open_page(server.invitation("#/history/car-1"))
+    chart = page.locator(".history .charts .plot canvas").first
+    chart.wait_for()
+    drawn(page)
+    before = chart.screenshot()
+    assert not page.locator(".history .incidents").is_visible()
+    lab.incidents = incidents
+    page.reload()
+    until(lambda: items(page, "history").count() == 3, "the incidents")
+    assert page.locator(".incidents .mark").all_inner_texts() == ["C", "B", "A"]
+    drawn(page)
+    assert chart.screenshot() != before
+    # Those of the range alone.
+    at_us = round(NOW_S - 7200) * 1_000_000
+    lab.incidents = [{**incidents[0], "from_us": at_us, "to_us": at_us + 1}]
+    page.reload()
+    until(lambda: not page.locator(".history .incidents").is_visible(), "another range")
+
+
+def test_the_fleet_says_how_many_incidents_the_last_day_had(open_page, server, car):
+    page = open_page(server.url)
+    show(page, car.send())
+    badge = page.locator("[data-robot=car-1] .incidents-badge")
+    until(lambda: badge.inner_text() == "3 incidents", "the number")
+    page.get_by_text("Not heard: 1 car").click()
+    assert page.locator("[data-absent=car-9] .incidents-badge").inner_text() == "1 incident"
