@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-all test-heavy test-fast test-oldest mutants check setup prove-mixed prove-ros2 wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-all test-heavy test-fast test-oldest mutants check setup prove-mixed prove-ros2 prove-recorder wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z0-9-]+:.*## ' Makefile | sed -E 's/^([a-z0-9-]+):.*## /\1\t/' | expand -t 14
@@ -73,6 +73,9 @@ prove-mixed: setup ## drive a robot of every shape of message beside rosbag reco
 prove-ros2: setup ## drive a robot of ROS 2 beside ros2 bag record: DURATION=60 REPORT=report.json, RMW_IMPLEMENTATION as for ROS 2
 	@IORT_ROS2_S=$(or $(DURATION),60) IORT_ROS2_REPORT=$(or $(REPORT),build/prove-ros2.json) \
 		$(BIN)/python -m pytest -rA tests/ros2/proof
+
+prove-recorder: setup ## prove that incidents are complete, in each ROS that is here: DURATION=60, 600 for five minutes without a broker
+	@IORT_RECORDER_S=$(or $(DURATION),60) $(BIN)/python -m pytest -rA tests/ros/recorder
 
 # The options of the bench's sections: `python -m bench.run --help` tells whose.
 BENCH_OPTIONS := CARS DURATION KILLS MESSAGES NEW OLD PART PRESSES QUICK RATE ROBOTS ROUNDS SECONDS SEED SOAK TRIES

@@ -1,12 +1,13 @@
 // Reads a recording with the libraries that Foxglove reads it with, and prints it, one JSON value a line:
 // a channel {topic, type, md5sum}, or a message {topic, t_ns, message}. Numbers beyond a double are texts. The
 // md5sum of a type of ROS 2 is its hash.
-// node foxglove_reader.cjs <node_modules> <file.mcap or file.bag>
+// node foxglove_reader.cjs <node_modules> <file.mcap or file.bag> [without]
+// With the word "without", messages are decoded and printed as null.
 const { createRequire } = require("node:module");
 const { open, readFile } = require("node:fs/promises");
 const { join, resolve } = require("node:path");
 
-const [modules, path] = process.argv.slice(2);
+const [modules, path, without] = process.argv.slice(2);
 const from = createRequire(join(resolve(modules), "x.js"));
 const { parse } = from("@foxglove/rosmsg");
 const { MessageReader } = from("@foxglove/rosmsg-serialization");
@@ -18,6 +19,7 @@ function plain(_, value) {
 }
 
 const print = (value) => process.stdout.write(`${JSON.stringify(value, plain)}\n`);
+const shown = (message) => (without ? null : message);
 
 // What Foxglove does with a channel: parse the definition, compile a reader of it.
 function reader(definition, ros2 = false) {
@@ -26,8 +28,12 @@ function reader(definition, ros2 = false) {
 
 async function mcap() {
   const zstd = from("@foxglove/wasm-zstd");
-  await zstd.isLoaded;
-  const decompressHandlers = { zstd: (data, size) => zstd.decompress(data, Number(size)) };
+  const lz4 = from("@foxglove/wasm-lz4");
+  await Promise.all([zstd.isLoaded, lz4.isLoaded]);
+  const decompressHandlers = {
+    lz4: (data, size) => lz4(data, Number(size)),
+    zstd: (data, size) => zstd.decompress(data, Number(size)),
+  };
   const { McapIndexedReader, McapStreamReader } = from("@mcap/core");
   const file = await open(path);
   const readable = {
@@ -53,7 +59,7 @@ async function mcap() {
   }
   for await (const { channelId, logTime, data } of indexed.readMessages()) {
     const { topic } = indexed.channelsById.get(channelId);
-    print({ topic, t_ns: logTime.toString(), message: readers.get(channelId).readMessage(data) });
+    print({ topic, t_ns: logTime.toString(), message: shown(readers.get(channelId).readMessage(data)) });
   }
   await file.close();
   // And without the index, which proves every checksum of the file.
@@ -75,7 +81,7 @@ async function bag() {
   }
   for await (const { topic, connectionId, timestamp, data } of opened.messageIterator()) {
     const t_ns = BigInt(timestamp.sec) * 1_000_000_000n + BigInt(timestamp.nsec);
-    print({ topic, t_ns, message: readers.get(connectionId).readMessage(data) });
+    print({ topic, t_ns, message: shown(readers.get(connectionId).readMessage(data)) });
   }
 }
 

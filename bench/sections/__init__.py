@@ -19,7 +19,7 @@ SECTIONS = (
     *("fleet", "mixed", "fairness"),
 )
 # Each is measured by its name alone.
-ALL = (*SECTIONS, "agent", "drive", "stop", "page", "cold", "analysis", "kept", "guard", "ros2")
+ALL = (*SECTIONS, "agent", "drive", "stop", "page", "cold", "analysis", "kept", "guard", "ros2", "recorder")
 
 
 def numbers(text: str) -> list[int]:

@@ -13,6 +13,7 @@ from bench.sections import (
     mixed,
     outage,
     query,
+    recorder,
     ros2,
     round_trips,
     utilisation,
@@ -149,6 +150,24 @@ def test_the_ros2_section_has_targets_for_processor_loss_and_delay():
             (0, True),
             (1.5, False),
         ),
+    ]
+
+
+def test_the_recorders_section_has_targets_for_processor_bytes_and_loss():
+    one = recorder.Run(
+        "rosbag record",
+        10.0,
+        10_000,
+        {recorder.WITH: 0.3, recorder.WITHOUT: 0.1, recorder.RECORDER: 0.2},
+        {recorder.WITH: 32_000_000, recorder.RECORDER: 32_000_000},
+        {recorder.WITH: recorder.Spread(2.0, 3.0, 9), recorder.WITHOUT: recorder.Spread(1.5, 2.0, 9)},
+        0,
+        16_000_000,
+    )
+    section = Section("recorder", "")
+    recorder.report(section, [one])
+    assert [(ratio.value, ratio.reached) for ratio in section.ratios] == [
+        *((1.5, False), (1.0, True), (0.5, None), (0, True), (1.0, True), (0.001389, None)),
     ]
 
 
