@@ -30,6 +30,11 @@ from iort_contract.topics import check_stream
 SETTLE_US = 200_000
 # A sample this much older than the newest is no late one: the clock was set back.
 _SET_BACK_US = 10_000_000
+# Samples that wait for older ones, and those of which a `delta` is: a time that stands still, or a stream of
+# many samples, must not fill the memory.
+MAX_WAITING, MAX_HISTORY = 10_000, 20_000
+# Calls of `delta` and `silent` in a condition.
+MAX_AGED = 4
 _MAX_DELTA_US, _MAX_SPAN_US = 60_000_000, 3_600_000_000
 _FAULT_WHEN = "fault_code"
 _UNITS = {"ms": 1_000, "s": 1_000_000, "m": 60_000_000, "min": 60_000_000, "h": 3_600_000_000}
@@ -81,6 +86,8 @@ def parse_trigger(when: str) -> Rule:
     tree = reader.parse()
     aged = reader.deltas.keys() | reader.silences.keys()
     fields = (expression.names(tree) - aged) | {name for name, _ in reader.deltas.values()}
+    if len(aged) > MAX_AGED:
+        raise ExpressionError(f"at most {MAX_AGED} of delta() and silent() in a condition", text, 0)
     if not fields and not aged:
         raise ExpressionError("a condition without a field is always true or never", text, 0)
     return Rule(text, tree, tuple(sorted(fields)), reader.deltas, reader.silences, for_us)
@@ -172,7 +179,8 @@ class Evaluator:
     def sample(self, stream: str, t_us: int, values: Mapping[str, Any]) -> tuple[Edge, ...]:
         """Take a sample; returns the edges that it makes certain.
 
-        Raises `MismatchError` if the condition compares a number with a text.
+        Raises `MismatchError` if the condition compares a number with a text, and `ContractError` if a
+        ``delta`` is of too many samples.
         """
         if stream not in self.streams:
             return self.advance(t_us)
@@ -186,7 +194,10 @@ class Evaluator:
         named = {name: self._value(field, values) for name, field in self.fields.get(stream, ())}
         self._count += 1
         heapq.heappush(self._waiting, (t_us, self._count, stream, named))
-        return edges + self.advance(t_us)
+        edges += self.advance(t_us)
+        if len(self._waiting) > MAX_WAITING:
+            edges += self._evaluate_until(self._waiting[0][0])
+        return edges
 
     def advance(self, t_us: int) -> tuple[Edge, ...]:
         """Take note that it is ``t_us``, in the time of the samples; returns the edges that this makes
@@ -300,6 +311,10 @@ def _change(history: deque[tuple[int, Value]], t_us: int, value: Value, age_us: 
     kinds."""
     if isinstance(value, str):
         return value
+    if len(history) >= MAX_HISTORY:
+        raise ContractError(
+            f"a delta of {age_us / 1_000_000:g} s is of more than {MAX_HISTORY} samples: choose a shorter one"
+        )
     history.append((t_us, value))
     while len(history) > 1 and history[1][0] <= t_us - age_us:
         history.popleft()

@@ -28,6 +28,7 @@ from iort_contract.messages.recorder import (
     TAKES,
     Take,
     Trigger,
+    check_room,
     decode_take,
     decode_trigger,
     encode_take,
@@ -93,12 +94,16 @@ def wanted(
         (kept if _is_fresh(name, content, now_us) else gone)[name] = content
     newest = sorted(findings, key=lambda one: (one.severity == SERIOUS, one.to_us), reverse=True)
     takes = [_take(one, triggers) for one in newest[: max(0, min(MOST, MAX_TAKES - len(kept)))]]
-    if not takes:
-        return {}, 0
-    entries: dict[str, Any] = dict.fromkeys(gone)
-    for take in takes:
-        entries |= encode_take(take, {})[RECORDER][TAKES]
-    return {RECORDER: {TAKES: entries}}, len(takes)
+    while takes:
+        entries: dict[str, Any] = dict.fromkeys(gone)
+        for take in takes:
+            entries |= encode_take(take, {})[RECORDER][TAKES]
+        try:
+            return dict(check_room(recorder, {RECORDER: {TAKES: entries}})), len(takes)
+        except ContractError:
+            # The shadow has no room for so many.
+            takes.pop()
+    return {}, 0
 
 
 def _on_findings(triggers: Mapping[str, Any]) -> Iterable[Trigger]:

@@ -11,7 +11,8 @@ import json
 import math
 import re
 from dataclasses import dataclass, field, fields
-from typing import Any, Callable, Mapping, TypeVar
+from itertools import islice
+from typing import Any, Callable, Collection, Mapping, TypeVar
 
 from iort_contract.checks import check_id, check_time, checked, shown
 from iort_contract.limits import ContractError, Value
@@ -20,6 +21,9 @@ from iort_contract.topics import ACCEPTED, NAME, check_stream
 
 # Triggers of a robot, and takes that wait in its shadow, which has 8 KB in all.
 MAX_TRIGGERS, MAX_TAKES = 8, 4
+# The settings and the emergency stop need room there, whatever the recorder does: the bytes of all triggers
+# and takes as JSON, and of all answers without their names.
+MAX_WANTED_BYTES, MAX_ANSWERS_BYTES = 4_000, 1_200
 MAX_TRIGGER_BYTES, MAX_WHEN, MAX_WHY = 600, 400, 160
 MAX_TOPICS = 16
 MAX_BEFORE_S = MAX_AFTER_S = 600.0
@@ -206,11 +210,29 @@ def encode_removal(name: str) -> dict[str, Any]:
     return {RECORDER: {TRIGGERS: {check_name(name): None}}}
 
 
-def encode_take(take: Take, waiting: Mapping[str, Any]) -> dict[str, Any]:
-    """The change of the desired part that adds a take to those ``waiting`` there; the oldest give way."""
-    newest = sorted(waiting, key=lambda other: _end(waiting[other]))
-    gone = newest[: max(0, len(newest) + 1 - MAX_TAKES)]
+def encode_take(take: Take, waiting: Mapping[str, Any], answered: Collection[str] = ()) -> dict[str, Any]:
+    """The change of the desired part that adds a take to those ``waiting`` there. Those that the robot has
+    ``answered`` give way first, and go anyway when they are old; then the oldest."""
+    order = sorted(waiting, key=lambda other: (other not in answered, _end(waiting[other])))
+    gone = order[: max(0, len(order) + 1 - MAX_TAKES)]
+    old_us = take.to_us - round(MAX_SPAN_S * _US)
+    gone += [other for other in order if other in answered and _end(waiting[other]) < old_us]
     return {RECORDER: {TAKES: {**dict.fromkeys(gone), take.id: _replacing(check_take(take), "id")}}}
+
+
+def check_room(there: Wanted, change: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a change of the desired part if the shadow has room for it beside what is ``there``; raises
+    `ContractError`."""
+    changed, before, after = _mapping(change.get(RECORDER)), 0, 0
+    for name, now in ((TRIGGERS, there.triggers), (TAKES, there.takes)):
+        before += _bytes(now)
+        after += _bytes({**now, **_mapping(changed.get(name))})
+    if after > max(before, MAX_WANTED_BYTES):
+        raise ContractError(
+            f"the triggers and takes of a robot must be at most {MAX_WANTED_BYTES} bytes together, "
+            f"got {after}: its shadow has no more room"
+        )
+    return change
 
 
 def decode_wanted(content: Any) -> Wanted:
@@ -225,8 +247,11 @@ def decode_answers(content: Any) -> dict[str, str]:
 
 
 def encode_answers(answers: Mapping[str, str]) -> dict[str, str]:
-    """The agent's answers, in few bytes."""
-    return {name: answer if answer == ACCEPTED else answer[:MAX_WHY] for name, answer in answers.items()}
+    """The agent's answers, in few bytes: whoever writes the shadow may name more triggers than there are."""
+    some = dict(islice(answers.items(), MAX_TRIGGERS + MAX_TAKES))
+    refused = sum(answer != ACCEPTED for answer in some.values())
+    most = min(MAX_WHY, MAX_ANSWERS_BYTES // max(1, refused))
+    return {name: answer if answer == ACCEPTED else answer[:most] for name, answer in some.items()}
 
 
 def _named(kind: Callable[..., T], key: str, name: str, content: Any) -> T:
@@ -260,6 +285,18 @@ def _check_topics(topics: tuple[str, ...]) -> None:
 def _within(what: str, value: float, low: float, high: float, unit: str) -> None:
     if not low <= value <= high:
         raise ContractError(f"{what} must be {low:g} to {high:g} {unit}, got {value:g}")
+
+
+def _bytes(contents: Mapping[str, Any]) -> int:
+    # What is null is removed.
+    left = {
+        name: {entry: value for entry, value in content.items() if value is not None}
+        if isinstance(content, Mapping)
+        else content
+        for name, content in contents.items()
+        if content is not None
+    }
+    return len(json.dumps(left, separators=(",", ":")))
 
 
 def _end(content: Any) -> int:

@@ -20,7 +20,7 @@ from collections import deque
 from typing import Any, Callable, Mapping, Tuple
 
 from iort_agent.common.schema import did_you_mean
-from iort_agent.recorder.plan import Edge, Plan
+from iort_agent.recorder.plan import MAX_TEXT, Edge, Plan
 from iort_agent.sources import Emit
 from iort_contract.catalog.derived import DERIVED, SOURCES
 from iort_contract.catalog.streams import TYPES_STREAM
@@ -142,7 +142,9 @@ class _Armed:
         self.streams.discard(stream)
 
     def _edge(self, t_us: int, values: Mapping[str, Value]) -> Edge:
-        return Edge(self.trigger.name, t_us, self.trigger.when or self.trigger.on, dict(values))
+        # The plan on disk has them, and is written for each edge.
+        short = {name: of[:MAX_TEXT] if isinstance(of, str) else of for name, of in values.items()}
+        return Edge(self.trigger.name, t_us, self.trigger.when or self.trigger.on, short)
 
     def _measure(self, busy_ns: int, now_us: int) -> None:
         self.busy_ns += busy_ns
@@ -236,7 +238,7 @@ class Triggers:
             try:
                 replayed = armed.evaluator is not None and any(map(self._replayed, armed.evaluator.streams))
                 edges = armed.take(batch, now_us, played_us=newest_us if replayed else None, last=last)
-            except MismatchError as error:
+            except (ContractError, MismatchError) as error:
                 armed.problem = str(error)
                 _log.error("recorder: trigger %s: %s", armed.trigger.name, error)
                 continue

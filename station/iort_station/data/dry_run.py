@@ -117,7 +117,7 @@ def dry_run(
     read = _Read(cloud, robot, start_us, end_us, progress)
     try:
         edges = list(_edges(evaluator, read))
-    except MismatchError as error:
+    except (ContractError, MismatchError) as error:
         raise StationError(f"the condition cannot be evaluated: {error}") from error
     found = windows(edges, trigger.before_us, trigger.after_us, trigger.cooldown_us)
     uploads = [] if trigger.notify else list(_uploads(cloud, robot, trigger, found))

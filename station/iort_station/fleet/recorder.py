@@ -123,8 +123,13 @@ def new_take(from_us: int, to_us: int, *, by: str, why: str = "", topics: Collec
 
 def send_take(cloud: Cloud, robot: str, taken: Take) -> None:
     """Have a robot keep what its ring has of a take, without waiting for it: one that is not connected does
-    so when it is back, as far as its ring reaches. The oldest takes in the shadow give way."""
-    _change(Shadow(cloud, robot), lambda state: messages.encode_take(taken, state.desired.recorder.takes))
+    so when it is back, as far as its ring reaches. Takes in the shadow that the robot has answered give way,
+    then the oldest. Raises `UsageError` if there is no room."""
+
+    def change(state: State) -> Mapping[str, Any]:
+        return messages.encode_take(taken, state.desired.recorder.takes, state.reported.recorder)
+
+    _change(Shadow(cloud, robot), change)
 
 
 def take(
@@ -187,7 +192,7 @@ def _change(shadow: Shadow, change: Callable[[State], Mapping[str, Any]]) -> Non
     for _ in range(_TRIES):
         state = shadow.read()
         try:
-            shadow.desire(change(state), state.version)
+            shadow.desire(messages.check_room(state.desired.recorder, change(state)), state.version)
         except shadow.data.exceptions.ConflictException:
             continue
         except ContractError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Tuple
 
@@ -18,19 +19,25 @@ from iort_contract.messages import recorder
 from iort_contract.messages.recorder import (
     FAULT,
     MAX_SPAN_S,
+    MAX_TOPICS,
     MAX_TRIGGER_BYTES,
     MAX_TRIGGERS,
     Incident,
     Take,
     Trigger,
+    Wanted,
+    check_room,
     decode_take,
     decode_trigger,
+    encode_removal,
     encode_take,
     encode_trigger,
     incident,
 )
 from iort_contract.messages.shadow import Reported, decode_desired, decode_reported, encode_reported
 from iort_contract.triggers import (
+    MAX_AGED,
+    MAX_WAITING,
     SETTLE_US,
     Edge,
     Evaluator,
@@ -127,6 +134,29 @@ def test_samples_that_come_too_late_are_counted() -> None:
     assert made.sample("vesc", S, {"x": 2}) == ()
     assert made.late == 1
     assert made.finish() == ()
+
+
+def test_a_time_that_stands_still_fills_no_memory() -> None:
+    made = evaluator("x > 1")
+    edges = [edge for i in range(3 * MAX_WAITING) for edge in made.sample("vesc", S, {"x": min(i, 2)})]
+    assert len(made._waiting) <= MAX_WAITING
+    assert [edge.t_us for edge in edges] == [S]
+    assert [edge.t_us for edge in edges_of(made, [("vesc", 2 * S, {"x": 0}), ("vesc", 3 * S, {"x": 2})])] == [
+        3 * S
+    ]
+
+
+def test_a_delta_of_too_many_samples_is_refused() -> None:
+    made = evaluator("delta(x, 60s) > 1")
+    with pytest.raises(ContractError, match="more than 20000 samples: choose a shorter one"):
+        edges_of(made, [("vesc", i * MS, {"x": 0}) for i in range(30_000)])
+    assert edges_of(evaluator("delta(x, 10s) > 1"), [("vesc", i * MS, {"x": 0}) for i in range(30_000)]) == []
+
+
+def test_a_condition_has_few_deltas() -> None:
+    parse_trigger(" or ".join(f"delta(x, {i}s) > 1" for i in range(1, MAX_AGED + 1)))
+    with pytest.raises(ExpressionError, match="at most 4 of delta"):
+        parse_trigger(" or ".join(f"delta(x, {i}s) > 1" for i in range(1, MAX_AGED + 2)))
 
 
 def test_a_clock_that_was_set_back_begins_anew() -> None:
@@ -397,20 +427,47 @@ def test_a_take_that_is_not_allowed_is_refused(change: dict[str, Any], told: str
     assert told in str(raised.value)
 
 
-def test_all_triggers_and_takes_fit_in_the_shadow() -> None:
-    room = "x > 1 or " * 40 + "x"
-    triggers = {
-        f"{i}" * 64: Trigger("a", room, topics=("/" + "b" * 60,)) for i in range(MAX_TRIGGERS)
-    }  # fmt: skip
-    desired = {
-        name: encode_trigger(trigger)["recorder"]["triggers"]["a"] for name, trigger in triggers.items()
+def desired_of(change: dict[str, Any]) -> dict[str, Any]:
+    """What AWS keeps of a change of nothing."""
+    return {
+        name: {key: value for key, value in one.items() if value is not None} for name, one in change.items()
     }
-    stored = {
-        name: {key: value for key, value in one.items() if value is not None} for name, one in desired.items()
-    }
-    answers = Reported(recorder=dict.fromkeys(triggers, "why not " * 100))
-    reported = encode_reported(answers)["recorder"]
-    assert len(json.dumps(stored)) + len(json.dumps(reported)) < 7_000
+
+
+def test_takes_that_were_answered_give_way_before_one_that_waits() -> None:
+    def at(i: int) -> Take:
+        return replace(TAKE, id=f"{i:08x}", from_us=i * S, to_us=(i + 1) * S)
+
+    takes = {at(i).id: {"to_us": at(i).to_us} for i in range(4)}
+    done = [at(i).id for i in (1, 2, 3)]
+    change = encode_take(at(4), takes, done)["recorder"]["takes"]
+    assert [name for name, content in change.items() if content is None] == [at(1).id]
+    later = encode_take(at(5_000), takes, done)["recorder"]["takes"]
+    assert [name for name, content in later.items() if content is None] == done
+
+
+def test_triggers_takes_and_answers_leave_room_in_the_shadow() -> None:
+    triggers: dict[str, Any] = {}
+    takes: dict[str, Any] = {}
+    for i in range(MAX_TRIGGERS):
+        trigger = Trigger(f"{i}" * 64, "x > 1 or " * 40 + "x", topics=("/" + "b" * 60,))
+        with suppress(ContractError):
+            change = check_room(Wanted(triggers, takes), encode_trigger(trigger))
+            triggers.update(desired_of(change["recorder"]["triggers"]))
+    assert len(triggers) < MAX_TRIGGERS
+    take = replace(TAKE, by="\u00e4" * 160, why="w" * 160, topics=("/" + "t" * 127,) * MAX_TOPICS)
+    with pytest.raises(ContractError, match="its shadow has no more room"):
+        check_room(Wanted(triggers, takes), encode_take(take, takes))
+    # What makes it smaller is allowed, whoever has written it.
+    full = Wanted({**triggers, "a": {"when": "x" * 5_000}})
+    check_room(full, encode_removal("a"))
+    check_room(full, encode_trigger(Trigger("a", "x > 1")))
+
+    answers = {**dict.fromkeys(triggers, "why not " * 100), **{f"{i:032x}": "no" * 100 for i in range(4)}}
+    reported = encode_reported(Reported(recorder=answers))["recorder"]
+    assert len(json.dumps(triggers)) + len(json.dumps(reported)) < 6_200
+    many = Reported(recorder={f"t{i}": "must be an object, got 1" for i in range(1_000)})
+    assert len(json.dumps(encode_reported(many)["recorder"])) < 1_000
 
 
 def test_the_answers_come_through_the_shadow() -> None:

@@ -710,3 +710,13 @@ def test_of_a_long_finding_the_end_is_taken() -> None:
     assert content["to_us"] == START_US + 3602 * S
     assert content["to_us"] - content["from_us"] == MAX_SPAN_S * S
     assert content.get("topics") is None, "one trigger wants all topics"
+
+
+def test_findings_take_no_room_that_the_shadow_does_not_have() -> None:
+    full = on_finding(topics=tuple(f"/{i}{'t' * 120}" for i in range(4)))
+    full |= on_finding("other", topics=tuple(f"/{i}{'u' * 120}" for i in range(4)))
+    some = [finding(at_us=START_US + i * 60 * S) for i in range(3)]
+    shadows = Shadows(car=shadow(full))
+    assert Takes(shadows).ask(CAR, some) == 2
+    ((_, takes),) = shadows.written
+    assert len(takes) == 2
