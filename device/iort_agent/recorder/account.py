@@ -44,7 +44,8 @@ class Losses:
         """What was lost between two times, and up to a second before and after."""
         before: Counted = {}
         after: Counted = self._looks[-1][1]
-        for at_us, counted in self._looks:
+        # A copy, since `look` is for another thread.
+        for at_us, counted in [*self._looks]:
             if at_us <= from_us:
                 before = counted
             elif at_us >= to_us:

@@ -26,6 +26,7 @@ from iort_contract.messages.files import File, file_key
 from iort_contract.messages.recorder import (
     KEPT,
     LOST,
+    MAX_AFTER_S,
     NOTIFIED,
     OVER_BUDGET,
     STATES,
@@ -51,6 +52,8 @@ _RETRY_S, _MAX_RETRY_S, _FLUSH_S, _GIVE_UP_FLUSH_US = 2.0, 60.0, 2.0, 30_000_000
 # What waits to be cut or uploaded; each is small in the plan, and the files are bounded in bytes.
 _MAX_INCIDENTS = 200
 _PAUSE_S = 0.002
+# A take that ends later would wait for ever where a clock is wrong.
+_MAX_AHEAD_US = round(MAX_AFTER_S * 1e6)
 
 
 class Ring(cut.Source, Protocol):
@@ -66,8 +69,8 @@ class StoppedError(Exception):
 
 
 class Incidents:
-    """All incidents of a robot. ``agent`` tells the agent's state at an edge. Safe to use from several
-    threads; `step` is for one."""
+    """All incidents of a robot. ``agent`` tells the agent's state at an edge; ``reserve`` are the bytes of
+    the disk that belong to the queue. Safe to use from several threads; `step` is for one."""
 
     def __init__(
         self,
@@ -78,6 +81,7 @@ class Incidents:
         clock: Clock,
         *,
         losses: Losses,
+        reserve: int = 0,
         tell: Tell,
         folder: Path,
         agent: Callable[[], Mapping[str, Any]] = dict,
@@ -86,7 +90,8 @@ class Incidents:
         self._losses, self._tell, self._agent = losses, tell, agent
         self.folder = folder
         self._max_bytes = round(config.max_mb * 1e6)
-        self._keep_free = round(config.keep_free_mb * 1e6 / 2)
+        # The ring gives way to an incident, and neither takes all of what belongs to the queue.
+        self._keep_free = round(max(config.keep_free_mb * 1e6, reserve) / 2)
         # Called after a new file.
         self.on_file: Callable[[], object] = lambda: None
         # Id -> the state that was told, and when.
@@ -136,6 +141,9 @@ class Incidents:
         edge = Edge("", take.to_us, "", {}, take.why, take.by)
         with self._plan.lock:
             if take.id in self._plan.takes:
+                return
+            if (ahead_us := take.to_us - self._clock.now_us()) > _MAX_AHEAD_US:
+                self.refuse(take.id, f"ends {ahead_us / 1e6:.0f} s from now, by the clock of the robot")
                 return
             self._plan.answer(take.id, ACCEPTED)
             self._add(

@@ -38,7 +38,9 @@ _MAX_BYTES = 8_000_000
 MAX_EDGES = 32
 # The budget of a day that has just ended may still be asked for: the clock may be set back.
 _DAYS = 2
-_TAKES, _MAX_TEXT = 32, 1000
+_TAKES = 32
+# Of a text in an edge, and in what readers are told.
+MAX_TEXT = 1000
 
 
 @dataclass
@@ -129,9 +131,9 @@ class Incident:
             from_us=self.from_us,
             to_us=self.to_us,
             state=KEPT if self.state == OPEN else self.state,
-            condition=first.when[:_MAX_TEXT],
-            why="; ".join(filter(None, (values, self.texts("why", "; "), self.why)))[:_MAX_TEXT],
-            by=self.texts("by", ", ")[:_MAX_TEXT],
+            condition=first.when[:MAX_TEXT],
+            why="; ".join(filter(None, (values, self.texts("why", "; "), self.why)))[:MAX_TEXT],
+            by=self.texts("by", ", ")[:MAX_TEXT],
             key=self.key if self.state == UPLOADED else "",
             bytes=self.size,
             messages=self.messages,

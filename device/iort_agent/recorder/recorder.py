@@ -88,6 +88,7 @@ class Recorder:
             self.ring,
             clock,
             losses=self._losses,
+            reserve=reserve,
             tell=tell,
             folder=_made(folder / "incidents"),
             agent=agent,

@@ -86,6 +86,7 @@ class Rig:
     triggers: Mapping[str, Any] | None = None
     report: Callable[[], Mapping[str, Any]] = dict
     max_mb: float = 100.0
+    reserve: int = 0
     told: list[Incident] = field(default_factory=list)
     on_tell: Callable[[], object] = lambda: None
 
@@ -103,6 +104,7 @@ class Rig:
             self.ring,
             self.clock,
             losses=self.losses,
+            reserve=self.reserve,
             tell=self._tell,
             folder=self.files,
             agent=lambda: {"version": "test"},
@@ -116,7 +118,9 @@ class Rig:
     def again(self) -> Rig:
         """The next run."""
         self.ring.run = f"{self.ring.run}+"
-        return Rig(self.folder, self.clock, self.ring, None, self.report, self.max_mb, self.told)
+        return Rig(
+            self.folder, self.clock, self.ring, None, self.report, self.max_mb, self.reserve, self.told
+        )
 
     def emit(self, stream: str = "vesc", **values: Value) -> None:
         """A sample of now."""

@@ -12,8 +12,10 @@ from mcap.reader import make_reader
 
 from iort_agent.common.private_files import write_below
 from iort_agent.recorder import incidents, plan
+from iort_agent.recorder.account import Losses
 from iort_agent.recorder.folder import Drop
-from iort_contract.messages.recorder import KEPT, LOST, NOTIFIED, OVER_BUDGET, UPLOADED
+from iort_contract.messages.recorder import KEPT, LOST, NOTIFIED, OVER_BUDGET, UPLOADED, Take
+from iort_contract.topics import ACCEPTED
 from tests.unit.agent.recorder.rig import BRAKE, T0, FakeRing, Rig, S
 
 
@@ -376,3 +378,64 @@ def test_incidents_wait_for_the_broker_within_their_room(tmp_path: Path) -> None
     assert "no room" in next(one.why for one in rig.told if one.state == LOST)
     waiting = list(states.values()).count(KEPT)
     assert len(rig.again().upload()) == waiting
+
+
+def test_long_texts_of_a_condition_do_not_make_the_plan_unreadable(tmp_path: Path) -> None:
+    trigger = {
+        "when": "said != 'x'",
+        "stream": "chatter",
+        "before_s": 1.0,
+        "after_s": 600.0,
+        "cooldown_s": 1.0,
+    }
+    rig = Rig(tmp_path, triggers={"said": trigger})
+    for i in range(20):
+        rig.emit("chatter", said="x")
+        rig.clock.advance(1)
+        rig.emit("chatter", said=f"{i}" * 500_000)
+        rig.clock.advance(1)
+        rig.watch.step()
+    assert len(next(iter(rig.plan.incidents.values())).edges) > 10
+    again = rig.again()
+    assert again.plan.alarm is None
+    assert list(again.plan.incidents) == list(rig.plan.incidents)
+
+
+def test_a_take_of_a_time_that_has_not_come_is_refused(tmp_path: Path) -> None:
+    # The robot's clock is years behind the operator's.
+    rig = Rig(tmp_path)
+    rig.pass_s(5)
+    ahead_us = 3 * 365 * 86_400 * S
+    rig.incidents.take(Take("a" * 16, T0 + ahead_us, T0 + ahead_us + 60 * S))
+    assert "by the clock of the robot" in rig.plan.takes["a" * 16]
+    assert rig.plan.incidents == {}
+    rig.incidents.take(Take("b" * 16, T0, T0 + 60 * S))
+    assert rig.plan.takes["b" * 16] == ACCEPTED
+
+
+def test_what_belongs_to_the_queue_is_not_for_incidents(
+    tmp_path: Path,
+) -> None:
+    rig = Rig(tmp_path, triggers={"hardbrake": BRAKE}, reserve=2**60)
+    rig.pass_s(10)
+    rig.brake()
+    rig.pass_s(8)
+    rig.cut()
+    assert list(rig.files.iterdir()) == []
+    assert "of the disk are free; it is tried again" in str(rig.incidents.alarm)
+
+
+def test_losses_may_be_looked_at_while_an_incident_is_cut() -> None:
+    counted = {"lost_by_middleware": 0}
+    losses = Losses([("source", lambda: {"/a": dict(counted)})], 0)
+
+    class Meanwhile(int):
+        """A time whose comparison takes so long that another thread looks."""
+
+        def __ge__(self, other: int) -> bool:
+            counted["lost_by_middleware"] += 1
+            losses.look(2 * S)
+            return int(self) >= other
+
+    assert losses.between(Meanwhile(S), 3 * S) == {}
+    assert losses.between(S, 3 * S)["/a"]["lost_by_middleware"] > 0
