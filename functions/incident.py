@@ -153,8 +153,7 @@ class Ways:
         """Tell of a sample whom nobody told of it yet. Raises `ContractError` for another event, and
         `WebhookError` if the webhook's receiver does not take it."""
         what = news(event)
-        by_webhook = self.webhook.stored()
-        if self.notify is None and not by_webhook:
+        if self.notify is None and not self.webhook.stored():
             return
         robot, notes = what.topic.robot, self.told.notes(what.topic.robot)
         if notes is None:
@@ -169,8 +168,11 @@ class Ways:
                     emit("incident", IncidentsHeld=1)
                 self.told.add(robot, note, now_s)
         note = _note(what, "webhook")
-        if by_webhook and note not in notes:
+        if note not in notes:
             try:
+                # After the mail, which must not wait for a webhook that cannot be read.
+                if not self.webhook.stored():
+                    return
                 self.webhook.deliver(what.body, what.delivery)
             except WebhookError:
                 emit("incident", WebhooksFailed=1)
@@ -197,7 +199,7 @@ def mail(what: News) -> tuple[str, str]:
             lines.append(f"{label:10}{text}")
     lines += ["", f"All incidents: iort incidents {robot}"]
     if one.state == KEPT:
-        lines.append(f"The file, once it is uploaded: iort incidents get {robot} {one.id}")
+        lines.append(f"The file, once it is uploaded: iort incidents get {one.id} --robot {robot}")
     return f"{what.topic.namespace}: {robot}, {trigger}, {MAILED[one.state]}", "\n".join(lines) + "\n"
 
 

@@ -114,10 +114,27 @@ def test_a_mail_says_what_happened_and_how_to_get_the_file():
     assert "2023-11-14 22:12:50 to 2023-11-14 22:13:20 UTC" in text
     assert "current_input < -15" in text
     assert "current_input = -17.5" in text
-    assert "iort incidents get car 0123456789abcdef" in text
+    (command,) = (line.partition(": ")[2] for line in text.splitlines() if "incidents get" in line)
+    assert command == "iort incidents get 0123456789abcdef --robot car"
     assert "incidents get" not in mail(news(event(LOST)))[1]
     # A robot may say any time.
     assert mail(news(event(from_us=2**62, to_us=-(2**62))))
+
+
+def test_a_webhook_that_cannot_be_read_holds_up_no_mail(ways, monkeypatch):
+    mailbox, webhook = Mailbox(), FakeWebhook()
+
+    def broken():
+        raise WebhookError("the parameter does not hold a webhook")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(webhook, "stored", broken)
+        for _ in range(2):
+            with pytest.raises(WebhookError):
+                ways(mailbox, webhook).tell(event(), NOW_S)
+    assert len(mailbox) == 1
+    ways(mailbox, webhook).tell(event(), NOW_S)
+    assert (len(mailbox), len(webhook.taken)) == (1, 1)
 
 
 def test_nobody_is_told_without_mails_and_webhook_and_nothing_is_read(ways):
