@@ -91,13 +91,12 @@ def get(
         chosen = [one for one in found if one.incident.state == UPLOADED]
     else:
         chosen = [_one(found, id_) for id_ in which or []]
-    there = [file for one in chosen if (file := files.stored(cloud, one.incident.key)) is not None]
+    stored = [(one, _stored(cloud, one)) for one in chosen]
+    there = [file for _, file in stored if file is not None]
     fetch(cloud, there, out_folder, force=force, as_json=as_json)
     if not chosen:
         errors.print("no uploaded incidents in this range", soft_wrap=True)
-    if len(there) < len(chosen):
-        keys = {file.key for file in there}
-        gone = (one.incident.id for one in chosen if one.incident.key not in keys)
+    if gone := [one.incident.id for one, file in stored if file is None]:
         raise StationError(f"not in the bucket any more: {', '.join(gone)}")
 
 
@@ -121,6 +120,15 @@ def _one(found: list[RobotIncident], id_: str) -> RobotIncident:
         why = f": {one.incident.why}" if one.incident.why else ""
         raise StationError(f"incident {id_} of {one.robot} is not uploaded, but {_state(one.incident)}{why}")
     return one
+
+
+def _stored(cloud: Cloud, one: RobotIncident) -> files.StoredFile | None:
+    """The file of an incident; None if the bucket does not have it. The robot itself has named the key."""
+    try:
+        file = files.stored(cloud, one.incident.key)
+    except StationError:
+        return None
+    return file if file is not None and file.robot == one.robot else None
 
 
 def _failed(one: RobotIncident) -> bool:

@@ -137,6 +137,27 @@ def test_what_cannot_be_downloaded_is_named(lab, iort, bucket, tmp_path):
     assert "give the ids of incidents, or --all" in str(iort(*get).exception)
 
 
+def test_a_key_that_is_none_of_the_robot_s_stops_no_other_download(lab, iort, bucket, tmp_path):
+    bucket()
+    bucket(2)
+    theirs = incidents(lab, "car")[0].incident.key
+    lab.tell(incident(UPLOADED, 7, key="../../etc/passwd"), START + 7)
+    lab.tell(incident(UPLOADED, 8, key=theirs), START + 8, robot="van")
+    done = iort("incidents", "get", "--all", "--out", str(tmp_path))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["brake-00000001.mcap", "brake-00000002.mcap"]
+    told = str(done.exception)
+    assert told.startswith("not in the bucket any more: ")
+    assert "00000007" in told
+    assert "00000008" in told
+
+
+def test_samples_of_other_types_stop_no_listing(lab):
+    lab.record(INCIDENT_STREAM, {"id": ["feedbeef"], "state": [5], "from_us": ["x"], "bytes": ["many"]})
+    lab.record(INCIDENT_STREAM, {"id": ["feedbeee"], "state": ["kept"], "from_us": [1e300], "to_us": [True]})
+    lab.tell(incident(), START + 30 * S)
+    assert [one.incident.id for one in incidents(lab)] == ["00000001"]
+
+
 class Notes:
     """A table that keeps notes."""
 
