@@ -6,7 +6,7 @@ It publishes 1,000 small messages, 30 of 100 KB and 20 demands a second. Each ha
 own. It prints ``ready`` when every topic has its subscribers and begins; FOLDER/NAME.sent has a line for each
 message: topic, number, time, stamp, subscribers, SHA-256. Lines on its input:
 
-- ``demand 3``: the demand is 3 for a fifth of a second
+- ``demand 3``: the next four demands are 3
 - ``back 120``: stamps are so many seconds earlier from now on
 - ``quit``: end
 """
@@ -28,7 +28,7 @@ from typing import Any
 SMALL, LARGE = "geometry_msgs/PointStamped", "sensor_msgs/Image"
 TOPICS = {"/small": (SMALL, 1000), "/large": (LARGE, 30), "/demand": (SMALL, 20)}
 LARGE_BYTES = 100_000
-_DEMAND_S = 0.2
+_DEMANDS = 4
 _noise = os.urandom(2 * LARGE_BYTES)
 # Publishes a message with this number, stamp in us and demand, and returns its bytes.
 Publish = Callable[[int, int, float], bytes]
@@ -108,14 +108,14 @@ class _Orders:
     def __init__(self) -> None:
         self.stop = threading.Event()
         self.back_us = 0
-        self._demand, self._until_s = 0.0, 0.0
+        self._demand, self._left = 0.0, 0
 
     def listen(self) -> None:
         """Follow the lines until one asks for the end."""
         for line in sys.stdin:
             word, _, number = line.strip().partition(" ")
             if word == "demand":
-                self._until_s, self._demand = time.monotonic() + _DEMAND_S, float(number)
+                self._demand, self._left = float(number), _DEMANDS
             elif word == "back":
                 self.back_us = int(number) * 1_000_000
             else:
@@ -123,7 +123,9 @@ class _Orders:
         self.stop.set()
 
     def demand(self) -> float:
-        return self._demand if time.monotonic() < self._until_s else 0.0
+        """The next demand."""
+        self._left -= 1
+        return self._demand if self._left >= 0 else 0.0
 
 
 def main() -> None:
@@ -150,7 +152,8 @@ def main() -> None:
             publish, subscribers = topics[topic]
             n, count, now_us = sent[topic], subscribers(), time.time_ns() // 1000
             stamp_us = now_us - orders.back_us
-            digest = hashlib.sha256(publish(n, stamp_us, orders.demand())).hexdigest()
+            demand = orders.demand() if topic == "/demand" else 0.0
+            digest = hashlib.sha256(publish(n, stamp_us, demand)).hexdigest()
             record.write(f"{topic} {n} {now_us} {stamp_us} {count} {digest}\n")
             sent[topic] = n + 1
     # What was published last is on its way.

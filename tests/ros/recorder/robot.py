@@ -113,7 +113,8 @@ class Robot:
 
     def set_back(self, seconds: int) -> None:
         """Set the robot's clock back."""
-        self.behind.write_text(f"{seconds}")
+        (made := self.behind.with_suffix(".part")).write_text(f"{seconds}")
+        made.replace(self.behind)
         self.publisher.say(f"back {seconds}")
 
     @contextmanager
@@ -128,14 +129,12 @@ class Robot:
                 with suppress(OSError):
                     while True:
                         file.write(_MEGABYTE)
-                return any("ring" in alarm for alarm in self.status().get("alarms", []))
+                return self._ring_stopped() is True
 
             until(full, within_s=WAIT_S)
         yield
         filler.unlink()
-        until(
-            lambda: not any("ring" in one for one in self.status().get("alarms", ["ring"])), within_s=WAIT_S
-        )
+        until(lambda: self._ring_stopped() is False, within_s=WAIT_S)
 
     # --- what is seen ------------------------------------------------------------------------------
 
@@ -146,6 +145,12 @@ class Robot:
             return fetch(self.bundle.folder / SOCKET)
         except AgentError:
             return {}
+
+    def _ring_stopped(self) -> bool | None:
+        """Whether the ring says that it has no room; None without a status."""
+        alarms = self.status().get("alarms")
+        said = ("the ring cannot", "the ring keeps nothing")
+        return None if alarms is None else any(part in alarm for alarm in alarms for part in said)
 
     def recorder(self, name: str) -> int:
         """One of the recorder's counts."""
