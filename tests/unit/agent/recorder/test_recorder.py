@@ -250,7 +250,7 @@ def test_a_window_begins_in_the_run_before(running: Callable[..., Agent], tmp_pa
     assert first.recorder is not None
     first.recorder.want(Wanted({"hardbrake": {**BRAKE, "before_s": 60.0, "after_s": 0.1}}, {}))
     folder = tmp_path / "ring" / "incidents"
-    until(lambda: first.recorder is not None and first.recorder.answers, within_s=30.0)
+    until(lambda: first.recorder is not None and first.recorder.answers and len(sent) > 5, within_s=30.0)
     before = end(first)
     running()
     until(lambda: list(folder.glob("*.mcap")), within_s=30.0)
