@@ -69,22 +69,48 @@ def _lost(counts: Mapping[str, Any]) -> dict[str, int]:
     return lost
 
 
+class _Run:
+    """The numbers of a topic's messages in one run: the first and last of the window, how many are between
+    them, and the numbers that came just before and just after the window."""
+
+    def __init__(self) -> None:
+        self._first, self._last, self._count = 2**62, -1, 0
+        self._before: list[int] = []
+        self._after: list[int] = []
+
+    def take(self, seq: int, *, kept: bool, early: bool) -> None:
+        if kept:
+            self._first, self._last = min(self._first, seq), max(self._last, seq)
+            self._count += 1
+        else:
+            (self._before if early else self._after).append(seq)
+
+    def gap(self) -> int:
+        """How many numbers of the window are nobody's; of a gap at its end, all may be of the window."""
+        first = min(self._first, max(self._before, default=2**62))
+        last = max(self._last, min(self._after, default=-1))
+        there = sum(first <= seq <= last for seq in (*self._before, *self._after))
+        return max(0, last - first + 1 - self._count - there)
+
+
 class _Topic:
-    """What came of a topic: the messages of the window, and by run the first number, the last one and how
-    many there were between them."""
+    """What came of a topic: the messages of the window, and their numbers by run."""
 
     def __init__(self, stream: str) -> None:
         self.stream, self.messages = stream, 0
-        self.runs: dict[tuple[str, str, bytes], tuple[int, int, int]] = {}
+        self._runs: dict[tuple[str, str, bytes], _Run] = {}
 
-    def take(self, message: RingMessage) -> None:
+    def take(self, message: RingMessage, *, kept: bool, early: bool) -> None:
         # Each type of a topic is numbered by itself.
         numbered = message.channel.run, message.channel.schema, message.channel.definition
-        first, last, count = self.runs.get(numbered, (message.seq, message.seq, 0))
-        self.runs[numbered] = min(first, message.seq), max(last, message.seq), count + 1
+        run = self._runs.get(numbered)
+        if run is None:
+            run = self._runs[numbered] = _Run()
+        run.take(message.seq, kept=kept, early=early)
+        self.messages += kept
 
     def gaps(self) -> int:
-        return sum(max(0, last - first + 1 - count) for first, last, count in self.runs.values())
+        return sum(run.gap() for run in self._runs.values())
 
 
 class Account:
@@ -97,14 +123,13 @@ class Account:
         self.runs: dict[str, list[int]] = {}
         self.pauses: list[tuple[int, int, str]] = []
 
-    def take(self, message: RingMessage, *, kept: bool) -> None:
-        """Count a message; those just outside of the window tell of gaps at its ends."""
+    def take(self, message: RingMessage, *, kept: bool, early: bool) -> None:
+        """Count a message; those just outside of the window, ``early`` or later, tell of gaps at its ends."""
         channel = message.channel
         topic = self._topics.get(channel.topic)
         if topic is None:
             topic = self._topics[channel.topic] = _Topic(channel.stream)
-        topic.take(message)
-        topic.messages += kept
+        topic.take(message, kept=kept, early=early)
         self.messages += kept
         run = self.runs.setdefault(channel.run, [message.ring_us, message.ring_us])
         run[0], run[1] = min(run[0], message.ring_us), max(run[1], message.ring_us)

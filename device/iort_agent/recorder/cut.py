@@ -164,7 +164,7 @@ def _copied(ring: Source, incident: Incident, writer: Any, account: Account) -> 
     writer.start(_PROFILES.get(first.channel.encoding, "") if first is not None else "", _LIBRARY)
     for message in chain([first] if first is not None else [], messages):
         kept = from_us <= message.ring_us <= to_us or incident.from_us <= message.t_us <= incident.to_us
-        account.take(message, kept=kept)
+        account.take(message, kept=kept, early=message.ring_us < from_us)
         if kept:
             writer.add_message(
                 channels.id_of(message.channel),

@@ -439,3 +439,19 @@ def test_losses_may_be_looked_at_while_an_incident_is_cut() -> None:
 
     assert losses.between(Meanwhile(S), 3 * S) == {}
     assert losses.between(S, 3 * S)["/a"]["lost_by_middleware"] > 0
+
+
+def test_what_is_missing_beside_the_window_is_not_missing_in_it(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
+    rig.pass_s(10)
+    edge_us = rig.clock.now_us()
+    rig.brake()
+    rig.pass_s(8)
+    # Half a second before the window, half a second after it, and in it.
+    for at_us in (edge_us - 5_500_000, edge_us + 2_500_000, edge_us - S):
+        rig.ring.messages = [one for one in rig.ring.messages if abs(one.ring_us - at_us) > 120_000]
+    rig.cut()
+    _, metadata = content(only_file(rig))
+    account = json.loads(metadata["iort.account"]["/vesc"])
+    assert account["why"] == {"not_in_ring": 3}
+    assert account["messages"] == 71 - 3
