@@ -98,6 +98,8 @@ class Incidents:
         self._told: dict[str, tuple[str, float]] = {}
         # Id -> when it is tried again, and how often it failed.
         self._held: dict[str, tuple[float, int]] = {}
+        # Trigger -> the ring's time of its last edge in this run that counted.
+        self._last_ring_us: dict[str, int] = {}
         self.alarm: str | None = None
         self.counts = dict.fromkeys(("edges", "cooled", "merged", *STATES), 0)
         for part in folder.glob(f"*{cut.PART}"):
@@ -115,10 +117,14 @@ class Incidents:
         plan, name = self._plan, trigger.name
         with plan.lock:
             self.counts["edges"] += 1
-            if cools(plan.last_us.get(name), edge.t_us, trigger.cooldown_us):
+            last_us = plan.last_us.get(name)
+            # Where times go back, and perhaps forth again, the ring's time counts.
+            back = last_us is not None and edge.t_us < last_us
+            times = (self._last_ring_us.get(name), ring_us) if back else (last_us, edge.t_us)
+            if cools(*times, trigger.cooldown_us):
                 self.counts["cooled"] += 1
                 return
-            plan.last_us[name] = edge.t_us
+            plan.last_us[name], self._last_ring_us[name] = edge.t_us, ring_us
             incident = Incident(
                 id=incident_id(self._robot, name, edge.t_us),
                 from_us=edge.t_us - trigger.before_us,

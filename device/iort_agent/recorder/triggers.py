@@ -108,7 +108,7 @@ class _Armed:
             horizon_us, horizon_at_us = t_us, at_us
         for edge_us, values in (*late, *(evaluator.finish() if last else ())):
             found.append((self._edge(edge_us, values), _ring_us(horizon_at_us, horizon_us, edge_us)))
-        self._measure(time.thread_time_ns() - began, now_us)
+        self._measure(time.thread_time_ns() - began, now_us, played=played_us is not None)
         return found
 
     def answer(self, now_us: int) -> str:
@@ -146,12 +146,12 @@ class _Armed:
         short = {name: of[:MAX_TEXT] if isinstance(of, str) else of for name, of in values.items()}
         return Edge(self.trigger.name, t_us, self.trigger.when or self.trigger.on, short)
 
-    def _measure(self, busy_ns: int, now_us: int) -> None:
+    def _measure(self, busy_ns: int, now_us: int, *, played: bool) -> None:
         self.busy_ns += busy_ns
         self._busy_ns += busy_ns
         # A recording may be played faster than time passes.
         first_us = self._newest[0] if self._first_us is None else self._first_us
-        passed_us = max(now_us - self._since_us, self._newest[0] - first_us)
+        passed_us = max(now_us - self._since_us, self._newest[0] - first_us if played else 0)
         if busy_ns <= _MAX_AT_ONCE_NS and passed_us < _MEASURED_US:
             return
         share = self._busy_ns / 1000 / max(1, passed_us)

@@ -127,6 +127,38 @@ def test_one_that_costs_too_much_is_refused_and_the_others_go_on(
     assert rig.watch.answers()["dear"] == ACCEPTED
 
 
+def test_times_that_jump_ahead_hide_no_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    busy_ns = 0
+    sample = Evaluator.sample
+
+    def slow(self: Evaluator, *args: Any) -> Any:
+        nonlocal busy_ns
+        busy_ns += 4_000_000
+        return sample(self, *args)
+
+    monkeypatch.setattr(Evaluator, "sample", slow)
+    monkeypatch.setattr(time, "thread_time_ns", lambda: busy_ns)
+    rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
+    for i in range(1_500):
+        ahead_us = 3_600 * S if i % 10 == 9 else 0
+        rig._emit("vesc", rig.clock.now_us() + ahead_us, {"current_input": 0.0})
+        rig.clock.advance(0.01)
+        rig.watch.step()
+    assert rig.watch.answers()["hardbrake"].startswith("costs too much: 40% of a core")
+
+
+def test_two_clocks_in_a_stream_pass_no_cooldown(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, triggers={"hardbrake": {**BRAKE, "cooldown_s": 60.0}})
+    for i in range(100):
+        ahead_us = 3_600 * S if i % 2 else 0
+        for current in (0.0, -20.0):
+            rig._emit("vesc", rig.clock.now_us() + ahead_us, {"current_input": current})
+            rig.clock.advance(0.25)
+        rig.watch.step()
+    assert rig.incidents.counts["edges"] > 90
+    assert len(edges(rig)) <= 2
+
+
 def test_one_that_stalls_is_refused_in_the_middle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     busy_ns = 0
 
