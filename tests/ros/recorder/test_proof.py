@@ -67,8 +67,7 @@ def test_windows_that_overlap_are_one_file(drive: Drive) -> None:
 
 
 def test_a_foreign_reader_recovers_the_ring_of_a_killed_agent(drive: Drive) -> None:
-    in_ring, written = drive.recovered
-    assert in_ring >= written
+    assert drive.recovered >= drive.written > 0
 
 
 def test_cooldown_and_budget_hold(drive: Drive) -> None:
