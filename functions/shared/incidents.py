@@ -37,8 +37,12 @@ class Announcer:
         self._limiter = RateLimiter(burst=BURST, a_second=A_SECOND)
 
     def announce(self, topic: str, batches: Iterable[Batch]) -> list[Batch]:
-        """Give each sample to the function; return the batches that it did not get whole."""
-        return [batch for batch in batches if not self._give(topic, batch)]
+        """Give each sample to the function; return the batches that it did not get whole. After one, none is
+        tried: everybody's samples wait."""
+        left = list(batches)
+        while left and self._give(topic, left[0]):
+            del left[0]
+        return left
 
     def _give(self, topic: str, batch: Batch) -> bool:
         robot, now_s = parse_topic(topic).robot, self._clock()

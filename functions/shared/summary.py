@@ -11,7 +11,7 @@ from collections.abc import Set as AbstractSet
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from decimal import Decimal
-from functools import cache, partial
+from functools import cache
 from itertools import chain
 from typing import Any
 
@@ -336,10 +336,16 @@ def _summarized(
 
 
 @cache
+def caller() -> Any:
+    """A client that calls functions, and gives up long before its own function must end."""
+    quickly = Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 2})
+    return connect("lambda", config=quickly)
+
+
+@cache
 def _announcer() -> Announcer:
     # Most environments see no incident, and need no client for it.
-    client = cache(partial(connect, "lambda"))
-    return Announcer(client, variables(LaterEnvironment).incident_function)
+    return Announcer(caller, variables(LaterEnvironment).incident_function)
 
 
 @cache

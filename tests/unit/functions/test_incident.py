@@ -393,6 +393,27 @@ def announced():
     return client
 
 
+def test_a_function_that_cannot_be_called_holds_up_no_samples(monkeypatch):
+    from botocore.exceptions import ConnectTimeoutError
+
+    from functions.shared import summary
+
+    calls = []
+
+    class Hanging:
+        def invoke(self, **call):
+            calls.append(call)
+            raise ConnectTimeoutError(endpoint_url="lambda")
+
+    batches = [samples(KEPT) for _ in range(20)]
+    assert Announcer(Hanging, "incident").announce(TOPIC_OF_CAR, batches) == batches
+    assert len(calls) == 1
+    # One call ends long before Lambda 2 must.
+    monkeypatch.setattr(summary, "connect", lambda _service, config: config)
+    config = summary.caller.__wrapped__()
+    assert (config.connect_timeout + config.read_timeout) * config.retries["total_max_attempts"] < 20
+
+
 def test_lambda_2_announces_the_samples_of_incidents_alone(announced):
     from functions.shared.summary import process
 
