@@ -107,6 +107,8 @@ def _car(broker: Mosquitto, folder: Path, robot: str, source: str, *, ring: bool
     )
     certificate, key = broker.identity(robot)
     settings |= {"robot": robot, "certificate": str(certificate), "private_key": str(key)}
+    # Two agents of one graph are two nodes.
+    settings["sources"][0]["node"] = f"iort_{robot}"
     (home := folder / robot).mkdir()
     if ring:
         for topic in _RING_TOPICS:
