@@ -116,13 +116,14 @@ class Drive:
         robot = self.robot
         with robot.full_disk():
             self._fire()
+            self._pause.wait(2 * AFTER_S)
 
-            def ended() -> list[Incident]:
-                found = robot.incidents().values()
-                return [one for one in found if one.id not in self._known and one.state != KEPT]
+        def ended() -> list[Incident]:
+            found = robot.incidents().values()
+            return [one for one in found if one.id not in self._known and one.state != KEPT]
 
-            (self.while_full,) = until(ended, within_s=120)
-            self._known.add(self.while_full.id)
+        (self.while_full,) = until(ended, within_s=120)
+        self._known.add(self.while_full.id)
         self._collect("after a full disk", self._fire())
 
     def _with_a_clock_set_back(self) -> None:
