@@ -28,6 +28,10 @@ settings.register_profile("fast", settings.get_profile("iort"), max_examples=10,
 # here. Without a name each file is a group, but starts early all the same: those of the browser are long.
 GROUPS = {
     "tests/local/commands/test_demo.py": "demo",
+    # Two graphs of ROS 2 at once take the time of one another's discovery.
+    "tests/ros2/": "ROS 2",
+    # All tests of a ROS look at one drive of minutes.
+    "tests/ros/recorder/": "ROS 2",
     "tests/local/commands/": "cloud of the data",
     # Before the others have raised the alarms that it waits for.
     "tests/local/operations/test_eyes.py": "cloud of the data",
@@ -49,8 +53,6 @@ GROUPS = {
     "tests/stacks/": "app",
     "tests/unit/functions/test_admit.py": "app",
     "tests/local/pubnub/": "PubNub",
-    # Two graphs of ROS 2 at once take the time of one another's discovery.
-    "tests/ros2/": "ROS 2",
 }
 
 
