@@ -28,7 +28,7 @@ ANSWERS: dict[str, tuple[Any, set[str]]] = {
     "archive": ({}, {"Query"}),
     "echo": (None, {"Topic"}),
     "evaluate": ({"drives": 0, "findings": 0}, {"Object", "Write"}),
-    "incident": (None, {"GetParameter", "GetItem"}),
+    "incident": (None, {"GetItem"}),
     "later": (None, {"GetItem"}),
     "live": (None, {"GetParameter", "PubNub"}),
     "plan": ({"drives": 0}, {"GetItem", "Query", "Write"}),
