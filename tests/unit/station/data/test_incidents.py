@@ -77,7 +77,8 @@ def test_a_sample_that_is_no_incident_is_passed_over(lab):
     assert len(incidents(lab, "car")) == 1
 
 
-def test_a_table_of_incidents_says_why_one_is_not_uploaded(lab, iort):
+def test_a_table_of_incidents_says_why_one_is_not_uploaded(lab, iort, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
     lab.tell(incident(OVER_BUDGET, why="brake has spent its 500 MB"), START)
     lab.tell(incident(UPLOADED, number=2, bytes=12_300_000, missing=3), START)
     lab.tell(incident(KEPT, number=3, why="speed=3"), START)
