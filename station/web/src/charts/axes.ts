@@ -2,23 +2,17 @@
 
 import type uPlot from "uplot";
 import { colour } from "../base/theme";
+import { type Mark, timeMarks } from "./time_axis";
 
 export interface Paint {
   text: string;
   grid: string;
 }
 
+/** The size of the labels, in rem. */
+export const FONT = 0.72;
 // The part of a range that is left free above and below.
 const ROOM = 0.04;
-
-export const DAY_S = 86_400;
-/** The steps of an axis of time. Each is at most two and a half times the one before, so that every range has several
- *  labels. */
-export const TIME_STEPS_S = [
-  ...[1e-3, 1e-2, 0.1].flatMap((power) => [power, 2 * power, 5 * power]),
-  ...[1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14_400, 21_600, 43_200],
-  ...[1, 2, 5, 10, 15, 28, 56, 84, 168, 365, 730, 1825, 3650].map((days) => days * DAY_S),
-];
 
 export const calm = (): boolean => window.matchMedia("(prefers-reduced-motion: reduce)").matches;
 
@@ -32,13 +26,27 @@ export function rem(times: number): number {
 
 export function axis(colours: () => Paint, size: number, gap: number, more: uPlot.Axis): uPlot.Axis {
   return {
-    font: `${Math.round(rem(0.72))}px ${getComputedStyle(document.body).fontFamily}`,
+    font: `${Math.round(rem(FONT))}px ${getComputedStyle(document.body).fontFamily}`,
     size: rem(size),
     gap: rem(gap),
     stroke: () => colours().text,
     grid: { stroke: () => colours().grid, width: 1 },
     ticks: { show: false },
     ...more,
+  };
+}
+
+/** The marks of an axis of time: as many as have room. */
+export function timeAxis(): Pick<uPlot.Axis, "splits" | "values"> {
+  let marks: readonly Mark[] = [];
+  return {
+    splits: ({ bbox }, _, from, to) => {
+      const width = bbox.width / devicePixelRatio;
+      // A digit is a bit wider than half its height; two stay free between labels.
+      marks = timeMarks(from, to, (chars) => Math.floor(width / ((chars + 2) * rem(FONT) * 0.6)));
+      return marks.map(({ at }) => at);
+    },
+    values: () => marks.map(({ label }) => label),
   };
 }
 

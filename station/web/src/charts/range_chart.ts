@@ -4,7 +4,7 @@ import uPlot from "uplot";
 import { dayTime, number, when } from "../base/format";
 import type { Range } from "../base/range";
 import { colour, onTheme } from "../base/theme";
-import { axis, DAY_S, faint, fit, holes, labels, PLAIN, paint, rem, roundRange, TIME_STEPS_S } from "./axes";
+import { axis, faint, fit, holes, labels, PLAIN, paint, rem, roundRange, timeAxis } from "./axes";
 import { gestures } from "./gestures";
 import { type About, Spoken } from "./spoken";
 
@@ -115,18 +115,16 @@ export class RangeChart {
           ...(options.sync ? { sync: { key: options.sync, setSeries: false } } : {}),
         },
         scales: {
-          x: { time: options.unit === undefined, auto: false, range: () => [...this.range] },
+          x: { time: false, auto: false, range: () => [...this.range] },
           y: { range: rounded },
           right: { range: rounded },
         },
         axes: [
           axis(colours, 1.5, 0.3, {
             space: rem(4.6),
-            ...(options.unit === undefined ? { incrs: TIME_STEPS_S } : {}),
-            values: (_, splits) =>
-              options.unit === undefined
-                ? timeLabels(splits)
-                : labels(splits).map((text) => `${text} ${options.unit}`),
+            ...(options.unit === undefined
+              ? timeAxis()
+              : { values: (_, splits) => labels(splits).map((text) => `${text} ${options.unit}`) }),
           }),
           axis(colours, 3.1, 0.4, { space: rem(2.2), values: (_, splits) => labels(splits) }),
           ...(right
@@ -257,31 +255,4 @@ export class RangeChart {
     if (dragged !== this || width < LEAST_DRAG_PX) return;
     hands?.zoom([plot.posToVal(left, "x"), plot.posToVal(left + width, "x")]);
   }
-}
-
-/** Times as precise as their steps. */
-function timeLabels(splits: readonly number[]): string[] {
-  const step = splits.length > 1 ? splits[1]! - splits[0]! : 60;
-  const day = { day: "numeric", month: "short" } as const;
-  const time = { hour: "2-digit", minute: "2-digit", hourCycle: "h23" } as const;
-  const options: Intl.DateTimeFormatOptions =
-    step >= 300 * DAY_S
-      ? { year: "numeric" }
-      : step >= 27 * DAY_S
-        ? { month: "short", year: "numeric" }
-        : step >= DAY_S * 0.9
-          ? day
-          : step >= DAY_S / 8
-            ? { ...day, ...time }
-            : step >= 60
-              ? time
-              : step >= 1
-                ? { ...time, second: "2-digit" }
-                : {
-                    minute: "2-digit",
-                    second: "2-digit",
-                    fractionalSecondDigits: step >= 0.1 ? 1 : step >= 0.01 ? 2 : 3,
-                  };
-  const format = new Intl.DateTimeFormat("en-GB", options);
-  return splits.map((at) => format.format(at * 1000));
 }
