@@ -1,12 +1,7 @@
 """Recorded samples: queried, listed by run, exported, and what the analysis says of them.
 
-    from iort_station import data
-    from iort_station.cloud import Cloud
-
-    ride = data.query(Cloud.find(), "car7", "vesc", "-10m", "now", fields=["speed", "speed_mps"])
-    ride.times_us, ride.columns["speed_mps"], ride.unit("speed"), ride.frame()
-
-It uses the contract, `iort_station.fleet` for the registry, and `iort_station.cloud`.
+It uses the contract, `iort_station.fleet` for the registry, and `iort_station.cloud`. Notebooks use
+`iort_station.lab`, which offers it.
 """
 
 from __future__ import annotations

@@ -6,14 +6,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iort_analysis.archive.stored import AUTO, Origin, PageProgress, Source
 from iort_analysis.samples.batches import in_order
-from iort_analysis.samples.blocks import Block, Column, join, resample
+from iort_analysis.samples.blocks import Block, Column, join, resample, values
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS
 from iort_contract.catalog.vesc import absent as is_absent
@@ -31,6 +31,11 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.times import Time, duration_us
 
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+    import pyarrow as pa
+
 # Where samples are selected: on this machine, or by the query function in the cloud.
 CLIENT, LAMBDA = "client", "lambda"
 _BY_DRIVER = tuple(field.name for field in VESC_FIELDS.values() if field.ros2_unit is not None)
@@ -45,8 +50,7 @@ class Result:
     for null, bool for flags, objects for texts. ``refused`` counts what is stored and cannot be read;
     ``reason`` names the first: topic, time and error. ``absent`` counts values by field that became null
     because their sensor is not fitted. ``ros2`` tells that charge and energy have the ROS 2 driver's units.
-    ``origin`` tells what came from the archive. ``kind_of`` returns the type of the stream's messages, if
-    known.
+    ``origin`` tells what came from the archive.
     """
 
     robot: str
@@ -58,22 +62,60 @@ class Result:
     ros2: bool = False
     absent: Mapping[str, int] = field(default_factory=dict)
     origin: Origin = field(default_factory=Origin)
-    kind_of: Callable[[], MessageType | None] = field(default=lambda: None, repr=False, compare=False)
+    # The type of the stream's messages, if known.
+    _kind_of: Callable[[], MessageType | None] = field(default=lambda: None, repr=False, compare=False)
 
     def __len__(self) -> int:
         return len(self.times_us)
 
     def unit(self, name: str) -> str:
         """The unit of a column; empty if unknown."""
-        return unit(self.stream, name, ros2=self.ros2, kind=self.kind_of())
+        return unit(self.stream, name, ros2=self.ros2, kind=self._kind_of())
 
-    def frame(self) -> Any:
-        """The samples as a pandas DataFrame, indexed by time in UTC."""
+    def pandas(self) -> pd.DataFrame:
+        """The samples as a DataFrame, indexed by ``time`` in UTC, with a column for each field."""
         # The import takes half a second.
         import pandas as pd  # noqa: PLC0415 - see above
 
         index = pd.to_datetime(self.times_us, unit="us", utc=True).rename("time")
         return pd.DataFrame(dict(self.columns), index=index)
+
+    def arrow(self) -> pa.Table:
+        """The samples as an Arrow table: ``time`` in microseconds, UTC, and a column for each field.
+
+        A field that is itself called ``time`` is the column ``_time``, as in the archive. A column of several
+        kinds of values is text. A field's metadata has its ``unit``, the schema's ``robot`` and ``stream``.
+        """
+        # A third of a second of import.
+        import pyarrow as pa  # noqa: PLC0415 - see above
+
+        from iort_analysis.archive.columns import column_name  # noqa: PLC0415 - imports pyarrow
+
+        arrays = [pa.array(self.times_us, type=pa.timestamp("us", tz="UTC"))]
+        fields = [pa.field("time", arrays[0].type, nullable=False)]
+        for name, column in self.columns.items():
+            try:
+                array = pa.array(column, from_pandas=True)
+            except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
+                # Numbers and texts, or integers beyond every type of Arrow: all as texts.
+                array = pa.array([None if value is None else str(value) for value in values(column)])
+            unit = self.unit(name)
+            fields.append(pa.field(column_name(name), array.type, metadata={"unit": unit} if unit else None))
+            arrays.append(array)
+        schema = pa.schema(fields, metadata={"robot": self.robot, "stream": self.stream})
+        return pa.Table.from_arrays(arrays, schema=schema)
+
+    def polars(self) -> pl.DataFrame:
+        """The samples as a Polars DataFrame, with the columns of `arrow`; their units are `unit`'s.
+
+        Raises `StationError` without Polars, which is an extra: ``pip install 'iort-station[polars]'``.
+        """
+        try:
+            import polars as pl  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            raise StationError("polars is not installed: pip install 'iort-station[polars]'") from error
+        # What is made of a table is a frame.
+        return cast("pl.DataFrame", pl.from_arrow(self.arrow()))
 
 
 def query(

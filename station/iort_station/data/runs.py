@@ -113,6 +113,12 @@ def runs(
     return {"runs": entries[:count], "older": len(entries) > count, "streams": extents}
 
 
+def reports(cloud: Cloud, robot: str, start_us: int | None, end_us: int | None) -> dict[str, Account]:
+    """The last account in a range of each run that sent one there, by the run's name."""
+    reader = _Reader(cloud, robot, ACCOUNT_STREAM)
+    return {part.last.boot: reader.report(part).account for part in reader.runs(start_us, end_us)}
+
+
 @dataclass(frozen=True)
 class StreamOverview:
     """A stream: its extent, its newest runs, and the fields of its newest batch with their units.

@@ -55,24 +55,11 @@ def to_json_lines(result: Result, file: IO[str]) -> None:
 
 
 def to_parquet(result: Result, file: IO[bytes]) -> None:
-    """Write ``time`` (microseconds, UTC) and a column for each field, with units in the metadata."""
+    """Write the samples as `Result.arrow` has them."""
     # A third of a second of import.
-    import pyarrow as pa  # noqa: PLC0415 - see above
-    import pyarrow.parquet as pq  # noqa: PLC0415 - as above
+    import pyarrow.parquet as pq  # noqa: PLC0415 - see above
 
-    arrays = [pa.array(result.times_us, type=pa.timestamp("us", tz="UTC"))]
-    fields = [pa.field("time", arrays[0].type, nullable=False)]
-    for name, column in result.columns.items():
-        try:
-            array = pa.array(column, from_pandas=True)
-        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
-            # Numbers and texts, or integers beyond every type of Parquet: all as texts.
-            array = pa.array([None if value is None else str(value) for value in values(column)])
-        unit = result.unit(name)
-        fields.append(pa.field(name, array.type, metadata={"unit": unit} if unit else None))
-        arrays.append(array)
-    schema = pa.schema(fields, metadata={"robot": result.robot, "stream": result.stream})
-    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
+    pq.write_table(result.arrow(), file, compression="zstd")
 
 
 def _rows(result: Result) -> Iterator[list[Sequence[Any]]]:

@@ -297,7 +297,7 @@ def last_batch(cloud: Cloud, robot: str, stream: str) -> Batch | None:
 
 # What is lost with a run that did not end properly, by whether its queue was durable; None is not known.
 _OPEN = "were in open batches, at most one second"
-_NOT_ENDED = {
+NOT_ENDED = {
     True: f"{_OPEN}: the run did not end properly",
     False: f"{_OPEN}, or waited in the queue, which was in memory: the run did not end properly",
     None: f"{_OPEN}, or in the queue if it was in memory: the run did not end properly",
@@ -309,14 +309,14 @@ def held_against(one: Audit, found: Mapping[str, Account], now_us: int) -> Audit
     stored = {run.boot: run for run in one.runs}
     accounted = {boot: run for boot, run in found.items() if one.stream in run.streams}
     newest_us = max((run.received_us for run in found.values()), default=0)
-    shortfalls: list[Shortfall] = []
+    lacking: list[Shortfall] = []
     for boot, run in accounted.items():
         stream = run.streams[one.stream]
         is_last = run.received_us == newest_us and now_us - run.received_us < SILENT_US
         running = is_last and not stream.ended
-        shortfalls += _shortfalls(boot, stream, stored.get(boot), running=running)
+        lacking += shortfalls(boot, stream, stored.get(boot), running=running)
     taken = sum(run.streams[one.stream].taken for run in accounted.values()) if accounted else None
-    return replace(one, taken=taken, shortfalls=tuple(shortfalls))
+    return replace(one, taken=taken, shortfalls=tuple(lacking))
 
 
 def without_lateness(one: Audit, found: Mapping[str, Account]) -> Audit:
@@ -337,13 +337,14 @@ def in_car(last: int | None, audits: Iterable[Audit], found: Mapping[str, Accoun
     return 0 if last and ended and not any(one.missing or one.shortfalls for one in audits) else last
 
 
-def _shortfalls(
+def shortfalls(
     boot: str, stream: StreamAccount, stored: RunAudit | None, *, running: bool
 ) -> Iterator[Shortfall]:
+    """What a run's account of a stream says that is not stored."""
     if stream.refused:
         yield Shortfall(boot, stream.refused, "refused by the agent: no message can hold them")
     if not stream.ended and not running:
-        yield Shortfall(boot, None, _NOT_ENDED[stream.durable])
+        yield Shortfall(boot, None, NOT_ENDED[stream.durable])
     if stored is None:
         if stream.stored:
             yield Shortfall(boot, stream.stored, "in batches that are not stored")

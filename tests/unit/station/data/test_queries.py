@@ -122,7 +122,7 @@ def test_nulls_and_missing_fields_are_nan():
     found = data.query(cloud, "car", "vesc")
     np.testing.assert_array_equal(found.columns["speed"], [np.nan, 1.5, 2])
     np.testing.assert_array_equal(found.columns["duty_cycle"], [np.nan, np.nan, 0.1])
-    frame = found.frame()
+    frame = found.pandas()
     assert list(frame.columns) == ["speed", "duty_cycle"]
     assert str(frame.index.tz) == "UTC"
     assert frame.index[0].value == START * 1000

@@ -1,0 +1,178 @@
+"""The audit's word about a range of a stream: complete, incomplete or unknown, and why.
+
+The range's batches are held against their neighbours outside it, which tell whether numbers are missing at
+its edges, and against the accounts of the runs, which tell what followed a run's last batch.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+from iort_analysis.samples.batches import RefusedItems
+from iort_contract.dynamodb import starting_between
+from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
+from iort_contract.messages.account import ACCOUNT_EVERY_S
+from iort_contract.messages.batch import batch_id
+from iort_contract.tables import BATCH
+from iort_station.cloud import Cloud
+from iort_station.data.accounts import SILENT_US, Account
+from iort_station.data.recorded import Recorded
+from iort_station.data.runs import reports
+from iort_station.operations.audit import NOT_ENDED, Audit, RunAudit, audit, headers, shortfalls
+from iort_station.times import iso
+
+Word: TypeAlias = Literal["complete", "incomplete", "unknown"]
+# Publishers whose batches interleave each have one within this time.
+_BESIDE_US = 2 * MAX_BATCH_SPAN_US
+# A run's last report comes this long after its last batch at most.
+_REPORT_US = round(2e6 * ACCOUNT_EVERY_S)
+_ENDLESS_US = 2**62
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What the audit says of a stream from ``start_us`` (inclusive) to ``end_us`` (exclusive), both
+    microseconds since the epoch; None is open.
+
+    ``word`` is "complete" if everything that the robot recorded there is stored, "incomplete" if something is
+    known to be missing or unreadable, and "unknown" if nobody can tell yet; ``why`` gives the reasons, and is
+    empty if complete. ``batches`` counts the stored ones that begin there, ``missing`` the batch numbers
+    that are not stored.
+    """
+
+    robot: str
+    stream: str
+    start_us: int | None
+    end_us: int | None
+    word: Word
+    why: tuple[str, ...]
+    batches: int
+    missing: int
+
+
+class _Reason(NamedTuple):
+    """Why a range is not complete; ``known`` if something is missing for sure."""
+
+    known: bool
+    text: str
+    missing: int = 0
+
+
+def verdict(
+    cloud: Cloud,
+    robot: str,
+    stream: str,
+    start_us: int | None = None,
+    end_us: int | None = None,
+    *,
+    refused: tuple[int, str] | None = None,
+) -> Verdict:
+    """The audit's word about a range. ``refused`` is what a reader of its samples could not read: how many
+    items, and the first; None has every batch of the table decoded here."""
+    recorded = Recorded(cloud, robot, stream)
+    # A batch that began before the range may reach into it.
+    low_us = None if start_us is None else start_us - MAX_BATCH_SPAN_US
+    before = None if low_us is None else recorded.before(low_us)
+    after = None if end_us is None else recorded.after(end_us)
+    first_us = None if before is None else before.t_us - _BESIDE_US
+    last_us = None if after is None else after.t_us + _BESIDE_US
+    low, high = start_us or 0, _ENDLESS_US if end_us is None else end_us
+    batches, bad = 0, RefusedItems()
+    if refused is None:
+        items: Iterator[Mapping[str, Any]] = headers(cloud, robot, stream, first_us, last_us, refused=bad)
+    else:
+        # Strings and numbers only, so no deserializer is needed.
+        stored = recorded.headers(starting_between(first_us, last_us))
+        items = ({name: next(iter(value.values())) for name, value in item.items()} for item in stored)
+
+    def counted() -> Iterator[Mapping[str, Any]]:
+        nonlocal batches
+        for item in items:
+            with suppress(ContractError):
+                batches += low <= batch_id(item.get(BATCH)).t_us < high
+            yield item
+
+    found = audit(stream, counted())
+    runs = found.runs
+    told = reports(cloud, robot, first_us, None if last_us is None else last_us + _REPORT_US) if runs else {}
+    reasons = [*_gaps(found, low, high), *_tails(runs, stream, told, low, high)]
+    if not runs:
+        reasons.append(_Reason(known=False, text=f"nothing of {robot} {stream} is stored"))
+    elif before is None and (oldest := min(runs, key=lambda run: run.first_us)).first_seq > 0:
+        text = (
+            f"the first stored batch is number {oldest.first_seq:,} of its run: before it is expired or lost"
+        )
+        reasons.append(_Reason(known=False, text=text))
+    unread, named = refused or (bad.count, bad.reason)
+    if unread := max(unread, found.refused):
+        text = f"{unread:,} stored items cannot be read" + (f"; the first: {named}" if named else "")
+        reasons.append(_Reason(known=True, text=text))
+    word: Word = "complete"
+    if reasons:
+        word = "incomplete" if any(one.known for one in reasons) else "unknown"
+    return Verdict(
+        robot=robot,
+        stream=stream,
+        start_us=start_us,
+        end_us=end_us,
+        word=word,
+        why=tuple(dict.fromkeys(one.text for one in reasons)),
+        batches=batches,
+        missing=sum(one.missing for one in reasons),
+    )
+
+
+def _gaps(found: Audit, low_us: int, high_us: int) -> Iterator[_Reason]:
+    """The numbers that are missing for sure in the range."""
+    for run in found.runs:
+        for gap in run.missing:
+            after_us, before_us = gap.after_us or 0, gap.before_us or _ENDLESS_US
+            if after_us < high_us and before_us > low_us:
+                where = f"after {iso(after_us)}" if gap.after_us else f"before {iso(before_us)}"
+                text = f"batches {gap.first:,} to {gap.last:,} of run {run.boot[:8]} are not stored, {where}"
+                yield _Reason(known=True, text=text, missing=gap.batches)
+    for lost in found.lost_runs:
+        text = f"none of the {lost.batches:,} batches of run {lost.boot[:8]} is stored"
+        yield _Reason(known=True, text=text, missing=lost.batches)
+
+
+def _tails(
+    runs: list[RunAudit], stream: str, told: Mapping[str, Account], low_us: int, high_us: int
+) -> Iterator[_Reason]:
+    """What may have followed the last stored batch of each run that is in the range."""
+    in_time = sorted(runs, key=lambda run: run.first_us)
+    for i, run in enumerate(in_time):
+        until_us = in_time[i + 1].first_us if i + 1 < len(in_time) else _ENDLESS_US
+        account = told.get(run.boot)
+        stated = None if account is None else account.streams.get(stream)
+        name = f"run {run.boot[:8]}"
+        if account is not None and run.first_us < high_us and run.last_us >= low_us:
+            for source, counts in account.not_recorded().items():
+                causes = ", ".join(f"{count:,} {cause}" for cause, count in counts.items())
+                text = f"{name} did not record all of {source}, at times that are not known: {causes}"
+                yield _Reason(known=False, text=text)
+        if run.last_us >= high_us or max(until_us, run.last_us) <= low_us:
+            continue
+        if account is None or stated is None:
+            text = f"{name} has no account of {stream}: what followed its last batch is not known"
+            yield _Reason(known=False, text=text)
+            continue
+        running = not stated.ended and time.time() * 1e6 - account.received_us < SILENT_US
+        lacking = stated.next_seq - 1 - run.last_seq
+        if running:
+            yield _Reason(known=False, text=f"{name} goes on: the robot may hold batches that come later")
+        elif lacking > 0 and not any(gap.last >= stated.next_seq - 1 for gap in run.missing):
+            text = f"batches {run.last_seq + 1:,} to {stated.next_seq - 1:,} of {name} are not stored"
+            yield _Reason(known=True, text=text, missing=lacking)
+        if not stated.ended and not running:
+            text = f"{name}: an unknown number of samples {NOT_ENDED[stated.durable]}"
+            yield _Reason(known=False, text=text)
+        # The agent counts a whole run, so a part of one cannot be compared.
+        if run.first_seq <= stated.first_seq and run.first_us >= low_us and not running:
+            for lost in shortfalls(run.boot, stated, run, running=False):
+                if lost.samples is not None:
+                    yield _Reason(known=True, text=f"{name}: {lost.samples:,} samples {lost.cause}")
