@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 # The position's fields in Pose2D, Odometry, PoseStamped and Point.
 _METRES = (
     ("x", "y"),
+    ("x_m", "y_m"),
     ("position.x", "position.y"),
     ("pose.position.x", "pose.position.y"),
     ("pose.pose.position.x", "pose.pose.position.y"),

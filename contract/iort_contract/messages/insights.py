@@ -121,7 +121,8 @@ class IncidentCounts(TypedDict):
 
 
 class KeepAnswer(TypedDict):
-    """Answers ``keep``: the robot's answer; null if it did not give one. ``reason`` says why it refused."""
+    """Answers ``keep`` and ``add_trigger``: the robot's answer; null if it did not give one. ``reason`` says
+    why it refused."""
 
     accepted: bool | None
     reason: str

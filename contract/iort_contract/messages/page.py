@@ -123,6 +123,59 @@ class StreamsAnswer(TypedDict):
     streams: list[str]
 
 
+class StreamFields(TypedDict):
+    """The fields of a stream with numbers, by its newest samples, and those of its ``position``: x and y in
+    metres, or latitude and longitude in ``degrees``; none without a position."""
+
+    numbers: list[str]
+    position: list[str]
+    degrees: bool
+
+
+class FieldsAnswer(TypedDict):
+    """Answers ``fields``: those of each stream of a robot."""
+
+    streams: dict[str, StreamFields]
+
+
+class RacelineAnswer(TypedDict):
+    """Answers ``raceline``: the closed line of least curvature on the page's track, and the time of a lap of
+    the default car; without points for the ``reason`` given."""
+
+    x_m: list[float]
+    y_m: list[float]
+    lap_s: float
+    reason: str
+
+
+class TriggerEntry(TypedDict):
+    """A trigger that a robot's event recorder is to have: its condition, or what else fires it, beside the
+    robot's ``answer``: "accepted", why not, or nothing yet. With ``notify`` it tells, and keeps nothing."""
+
+    name: str
+    stream: str
+    when: str
+    cooldown_s: float
+    notify: bool
+    answer: str
+
+
+class TriggersAnswer(TypedDict):
+    """Answers ``triggers`` and ``remove_trigger``: those of a robot."""
+
+    triggers: list[TriggerEntry]
+
+
+class DryRunAnswer(TypedDict):
+    """Answers ``dry_run``: how often a condition became true in the ``samples`` of a range, and how many
+    incidents would have told of it, after cooldown and merge; with the first ``times_s``."""
+
+    edges: int
+    told: int
+    samples: int
+    times_s: list[float]
+
+
 class RunPart(Extent):
     """What a run recorded of a stream. ``batches`` is how many it numbered. ``samples`` is how many the agent
     counted, up to its last report; null without a report."""
@@ -264,7 +317,8 @@ class Archived(Extent):
 
 class HistoryAnswer(TypedDict):
     """Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0
-    if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units.
+    if each row is a sample. A position is that of the row's last sample. ``ros2`` says whether charge and
+    energy have the ROS 2 driver's units.
     ``archive`` is null if all comes from the table. ``refused`` counts what is stored in the range and
     cannot be read; ``reason`` names the first by topic, time and error."""
 
@@ -401,6 +455,10 @@ Answer = Union[
     TagsAnswer,
     VehiclesAnswer,
     StreamsAnswer,
+    FieldsAnswer,
+    RacelineAnswer,
+    TriggersAnswer,
+    DryRunAnswer,
     HistoryAnswer,
     DashboardsAnswer,
     Dashboard,

@@ -80,6 +80,20 @@ def add(cloud: Cloud, robot: str, trigger: Trigger, seconds: float, *, withdraw:
     One that it refuses is taken back with ``withdraw``: what was there before stays. Raises `UsageError` for
     a trigger that no agent accepts, and for one too many.
     """
+    return slept(adding(cloud, robot, trigger, seconds, withdraw=withdraw))
+
+
+def adding(
+    cloud: Cloud,
+    robot: str,
+    trigger: Trigger,
+    seconds: float,
+    *,
+    withdraw: bool = True,
+    replaces: Callable[[Trigger], bool] = lambda _old: True,
+) -> Generator[None, None, Answer]:
+    """As `add`; it yields where that sleeps. Raises `UsageError` for a name whose trigger it must not
+    replace."""
     shadow, old = Shadow(cloud, robot), State()
 
     def change(state: State) -> Mapping[str, Any]:
@@ -91,27 +105,41 @@ def add(cloud: Cloud, robot: str, trigger: Trigger, seconds: float, *, withdraw:
                 f"{robot} has {len(there)} triggers, the most allowed: {', '.join(sorted(there))}. "
                 "`iort recorder remove` removes one"
             )
+        _check_may(robot, there, trigger.name, replaces)
         return messages.encode_trigger(trigger)
 
     _change(shadow, change)
     before = old.reported.recorder.get(trigger.name, "")
-    answer = slept(_answering(shadow, cloud, trigger.name, seconds, before))
+    answer = yield from _answering(shadow, cloud, trigger.name, seconds, before)
     if withdraw and answer.refused:
         _change(shadow, lambda _: _restored(old, trigger.name))
     return answer
 
 
-def remove(cloud: Cloud, robot: str, name: str) -> None:
-    """Remove a trigger; raises `StationError` if the robot is not to have one of this name."""
+def remove(
+    cloud: Cloud, robot: str, name: str, *, removes: Callable[[Trigger], bool] = lambda _old: True
+) -> None:
+    """Remove a trigger; raises `StationError` if the robot is not to have one of this name, and `UsageError`
+    if it must not be removed from here."""
     shadow = Shadow(cloud, robot)
 
     def change(state: State) -> Mapping[str, Any]:
         there = state.desired.recorder.triggers
         if name not in there:
             raise unknown(f"{robot} has no trigger {name}", [name], there, f"iort recorder list {robot}")
+        _check_may(robot, there, name, removes)
         return {messages.RECORDER: {messages.TRIGGERS: {name: None}}}
 
     _change(shadow, change)
+
+
+def _check_may(robot: str, there: Mapping[str, Any], name: str, may: Callable[[Trigger], bool]) -> None:
+    try:
+        allowed = name not in there or may(messages.decode_trigger(name, there[name]))
+    except ContractError:
+        allowed = may(Trigger(name))
+    if not allowed:
+        raise UsageError(f"{robot} has a trigger {name} that keeps messages: `iort recorder` changes it")
 
 
 def new_take(from_us: int, to_us: int, *, by: str, why: str = "", topics: Collection[str] = ()) -> Take:

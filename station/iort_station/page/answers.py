@@ -17,6 +17,7 @@ from iort_contract.messages.page import Answer, SendAnswer, SettingEntry, Settin
 from iort_contract.messages.shadow import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
+from iort_contract.track import Track
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.errors import StationError
@@ -24,7 +25,7 @@ from iort_station.fleet import control, registry, robots
 from iort_station.fleet.control import Shadow, State
 from iort_station.fleet.roles import has_drivers
 from iort_station.operations import alarms, cloudwatch
-from iort_station.page import history, incidents, insights, motion
+from iort_station.page import history, incidents, insights, motion, triggers
 from iort_station.page.page import DRIVE
 from iort_station.page.requests import Handler, robot_of, text, whole
 from iort_station.page.server import Download
@@ -33,8 +34,8 @@ from iort_station.page.server import Download
 _ANSWER_S = 10.0
 
 
-def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """Every answer, by its name."""
+def answers(cloud: Cloud, track: Track | None = None) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
+    """Every answer, by its name; ``track`` is the page's."""
 
     def minutes(request: Mapping[str, str]) -> int:
         return whole(request, "minutes", 1, 14 * 24 * 60)
@@ -44,6 +45,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "tags": lambda _request: {"tags": robots.tags(cloud)},
         "vehicles": lambda _request: {"vehicles": registry.vehicles(cloud)},
         "streams": lambda request: {"streams": inventory.streams_of(cloud, robot_of(request))},
+        "fields": lambda request: history.fields(cloud, request),
         "runs": lambda request: history.runs_of(cloud, request),
         "history": lambda request: history.history(cloud, request),
         "dashboards": lambda _request: {"dashboards": cloudwatch.dashboards(cloud)},
@@ -59,6 +61,9 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "analysis": lambda request: insights.progress(cloud, request),
         "laps": lambda request: insights.laps(cloud, request),
         "delta": lambda request: insights.delta(cloud, request),
+        "raceline": lambda _request: insights.raceline(track),
+        "triggers": lambda request: triggers.triggers(cloud, request),
+        "dry_run": lambda request: triggers.count(cloud, request),
         "notes": lambda request: insights.notes(cloud, request),
         "incidents": lambda request: incidents.incidents(cloud, request),
         "incident_counts": lambda _request: incidents.counts(cloud),
@@ -87,6 +92,8 @@ def keyed_actions(cloud: Cloud) -> dict[str, Handler]:
         "note": lambda request: insights.write_note(cloud, request),
         "delete_note": lambda request: insights.remove_note(cloud, request),
         "keep": lambda request: incidents.keep(cloud, request),
+        "add_trigger": lambda request: triggers.add(cloud, request),
+        "remove_trigger": lambda request: triggers.remove(cloud, request),
         "stop": motion.fleet(cloud).stop,
         **({DRIVE: lambda _request: motion.address(cloud, DRIVER)} if has_drivers(cloud) else {}),
     }

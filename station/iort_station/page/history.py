@@ -11,11 +11,12 @@ import numpy as np
 
 from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import Column, values
+from iort_analysis.samples.positions import PositionFields, position_fields
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Column as PageColumn
-from iort_contract.messages.page import HistoryAnswer, RunsAnswer
+from iort_contract.messages.page import FieldsAnswer, HistoryAnswer, RunsAnswer, StreamFields
 from iort_contract.ros.message import MessageType
 from iort_station import data
 from iort_station.cloud import Cloud
@@ -52,9 +53,9 @@ def runs_of(cloud: Cloud, request: Mapping[str, str]) -> RunsAnswer:
 def history(cloud: Cloud, request: Mapping[str, str]) -> HistoryAnswer:
     """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
 
-    A row of several samples has the minimum, the mean and the maximum of every number, the last complete
-    attachment, and the last value that is not null of everything else. Raises `StationError` for a request
-    that cannot be answered.
+    A row of several samples has the minimum, the mean and the maximum of every number, the last position and
+    the last complete attachment, and the last value that is not null of everything else. Raises
+    `StationError` for a request that cannot be answered.
     """
     start_us, end_us = (whole(request, name, 0, 2**53) for name in ("from_us", "to_us"))
     rows = whole(request, "rows", 2, MAX_ROWS)
@@ -77,16 +78,22 @@ def history(cloud: Cloud, request: Mapping[str, str]) -> HistoryAnswer:
         bins = (result.times_us - result.times_us[0]) // row_us
         starts = np.flatnonzero(np.append(True, bins[1:] != bins[:-1]))
     several = summary or row_us > 0
-    fields: dict[str, PageColumn] = {
+    rows_of: dict[str, PageColumn] = {
         name: _rows(each, starts, n, several=several) for name, each in columns.items() if name not in claims
     }
     for name, key in claims.items():
         # The fields of an attachment belong together, so they come from one sample.
-        column, ends = values(result.columns[name]), _last_known(result.columns[key], starts)
-        fields[name] = {"mean": [column[end] for end in ends]}
+        parts, ends = values(result.columns[name]), _last(_known(result.columns[key]), starts)
+        rows_of[name] = {"mean": [parts[end] for end in ends]}
+    if several and n and (place := _position(columns)) is not None:
+        # The mean of a curve is a place where the robot never was.
+        each = [columns[name][0] for name in place.names]
+        ends = _last(~np.isnan(each).any(axis=0), starts)
+        for name, column in zip(place.names, each, strict=True):
+            rows_of[name]["mean"] = values(column[ends])
     return {
         "times_s": [t_us / 1e6 for t_us in result.times_us[starts].tolist()],
-        "fields": fields,
+        "fields": rows_of,
         "samples": int(np.nansum(result.columns["n"])) if summary and "n" in result.columns else n,
         "ros2": result.ros2,
         "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
@@ -127,7 +134,7 @@ def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
 def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bool) -> PageColumn:
     mean, least, most = of
     if mean.dtype.kind != "f":
-        return {"mean": mean[_last_known(mean, starts)].tolist()}
+        return {"mean": mean[_last(_known(mean), starts)].tolist()}
     if not several or n == 0:
         return {"mean": values(mean)}
     known = ~np.isnan(mean)
@@ -142,18 +149,41 @@ def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bo
     }
 
 
-def _last_known(column: Column, starts: Any) -> Any:
-    """For each row the index of its last value that is not null, or of its last value if all are null.
+def _position(columns: Mapping[str, tuple[Column, ...]]) -> PositionFields | None:
+    return position_fields([name for name, (column, *_) in columns.items() if column.dtype.kind == "f"])
+
+
+def _known(column: Column) -> Any:
+    return np.array([value is not None for value in column.tolist()], dtype=bool)
+
+
+def _last(known: Any, starts: Any) -> Any:
+    """For each row the index of its last sample that is known, or of its last sample if none is.
 
     Most attachments of a camera are null, because the car keeps few of its pictures.
     """
-    n = len(column)
+    n = len(known)
     if not n:
         return starts
-    known = np.array([value is not None for value in column.tolist()])
-    ranked = np.where(known, np.arange(n), -1)
-    last = np.maximum.reduceat(ranked, starts)
+    last = np.maximum.reduceat(np.where(known, np.arange(n), -1), starts)
     return np.where(last >= starts, last, np.append(starts[1:], n) - 1)
+
+
+def fields(cloud: Cloud, request: Mapping[str, str]) -> FieldsAnswer:
+    """The fields of each stream of ``robot``, by its newest batch."""
+    robot = robot_of(request)
+    return {"streams": {name: _fields(cloud, robot, name) for name in inventory.streams_of(cloud, robot)}}
+
+
+def _fields(cloud: Cloud, robot: str, stream: str) -> StreamFields:
+    columns = _with_derived(inventory.newest_block(cloud, robot, stream).columns)
+    numbers = sorted(name for name, column in columns.items() if column.dtype.kind == "f")
+    place = position_fields(numbers)
+    return {
+        "numbers": numbers,
+        "position": [] if place is None else list(place.names),
+        "degrees": place is not None and place.degrees,
+    }
 
 
 MOST_BYTES = 1_000_000_000

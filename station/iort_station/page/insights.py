@@ -12,13 +12,17 @@ import numpy as np
 
 from iort_analysis import AnalysisError
 from iort_analysis.mining.laps import compare
+from iort_analysis.raceline import Limits, least_curvature, profile, reference
 from iort_analysis.results import Mined
 from iort_analysis.samples.blocks import Column
 from iort_contract.catalog.analysis import ANALYSIS_FAILED, GROUPS, KINDS, LAPS_TABLE, PLACES_TABLE
+from iort_contract.catalog.questions import CAR_LIMITS
 from iort_contract.messages import insights as messages
 from iort_contract.messages.analysis import AnalysedDrive, AnalysisRequest, Estimate, Finding
+from iort_contract.messages.page import RacelineAnswer
 from iort_contract.messages.recorder import MAX_SPAN_S
 from iort_contract.topics import check_robot
+from iort_contract.track import Track
 from iort_station.cloud import Cloud
 from iort_station.data import findings as stored
 from iort_station.data.runs import laps_within
@@ -196,6 +200,22 @@ def delta(cloud: Cloud, request: Mapping[str, str]) -> messages.DeltaAnswer:
         "one_mps": _known(compared["one_mps"]),
         "other_mps": _known(compared["other_mps"]),
     }
+
+
+@lru_cache(1)
+def raceline(track: Track | None) -> RacelineAnswer:
+    """The line of least curvature around the page's track, for a car of the usual limits."""
+    if track is None:
+        return {"x_m": [], "y_m": [], "lap_s": 0.0, "reason": "the page has no track"}
+    car = {name: limit.default for name, limit in CAR_LIMITS.items()}
+    try:
+        centre = reference(track, car.pop("width_m"))
+        points = centre.line(least_curvature(centre))
+        lap_s = profile(points, Limits(**car)).lap_s
+    except AnalysisError as error:
+        return {"x_m": [], "y_m": [], "lap_s": 0.0, "reason": str(error)}
+    x_m, y_m = np.round(points.T, 4).tolist()
+    return {"x_m": x_m, "y_m": y_m, "lap_s": lap_s, "reason": ""}
 
 
 def _known(column: Column) -> list[float | None]:

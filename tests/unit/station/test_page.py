@@ -12,11 +12,14 @@ from moto import mock_aws
 from iort_contract.catalog.analysis import GROUPS
 from iort_contract.messages.analysis import AnalysedDrive, DriveKey, Estimate, Finding
 from iort_contract.messages.batch import Batch
+from iort_contract.topics import RECORD, build_topic
+from iort_contract.track import Track
 from iort_station.errors import StationError
 from iort_station.page import insights
 from iort_station.page.answers import answers
 from iort_station.page.history import MAX_ROWS, history
 from iort_station.page.page import config, site_files, upload
+from testkit.dynamodb import ROBOTS, TELEMETRY, item_of, serialize
 from tests.unit.station.data.test_queries import START, cloud_of, ride
 from tests.unit.station.data.test_runs import driven_cloud
 
@@ -93,6 +96,58 @@ def test_the_fields_of_an_attachment_are_of_one_sample():
     assert two_rows(columns) == {
         f"data.{part}": {"mean": [values[1], values[3]]} for part, values in parts.items()
     }
+
+
+def test_a_position_is_that_of_a_rows_last_sample_and_no_mean_beside_the_track():
+    corner = {"x": [0.0, 4.0, 4.0, None], "y": [0.0, 0.0, 4.0, 4.0]}
+    rows = two_rows(corner)
+    assert (rows["x"]["mean"], rows["y"]["mean"]) == ([4.0, 4.0], [0.0, 4.0])
+    assert (rows["x"]["least"], rows["x"]["most"]) == ([0.0, 4.0], [4.0, 4.0])
+    degrees = two_rows({"latitude": [48.1, 48.2, 48.3, 48.4], "longitude": [11.1, 11.2, 11.3, 11.4]})
+    assert (degrees["latitude"]["mean"], degrees["longitude"]["mean"]) == ([48.2, 48.4], [11.2, 11.4])
+
+
+def test_the_fields_of_each_stream_say_which_are_its_position():
+    cloud = cloud_of(Batch("0badcafe", 0, [START], {"voltage_input": [12.0], "current_input": [1.0]}))
+    for stream, columns in {
+        "pose": {"pose.position.x": [1.0], "pose.position.y": [2.0], "frame": ["map"]},
+        "gps": {"latitude": [48.1], "longitude": [11.5]},
+        "laps": {"x_m": [1.0], "y_m": [2.0], "lap": [3]},
+    }.items():
+        cloud.table.put(
+            TELEMETRY, item_of(Batch("0badcafe", 0, [START], columns), build_topic(RECORD, "car", stream))
+        )
+    cloud.table.put(ROBOTS, {"robot": serialize("car"), "streams": serialize({"pose", "gps", "laps"})})
+    found = answers(cloud)["fields"]({"robot": "car"})["streams"]
+    assert found == {
+        "gps": {"numbers": ["latitude", "longitude"], "position": ["latitude", "longitude"], "degrees": True},
+        "laps": {"numbers": ["lap", "x_m", "y_m"], "position": ["x_m", "y_m"], "degrees": False},
+        "pose": {
+            "numbers": ["pose.position.x", "pose.position.y"],
+            "position": ["pose.position.x", "pose.position.y"],
+            "degrees": False,
+        },
+        "vesc": {
+            "numbers": ["current_input", "power_w", "voltage_input"],
+            "position": [],
+            "degrees": False,
+        },
+    }
+
+
+def test_the_raceline_is_that_of_the_pages_track():
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    half = (1.0,) * 40
+    track = Track(tuple(10 * np.cos(angle)), tuple(10 * np.sin(angle)), half, half)
+    cloud = cloud_of()
+    found = answers(cloud, track)["raceline"]({})
+    radius = np.hypot(found["x_m"], found["y_m"])
+    # Of a circle the widest line has the least curvature: 0.15 m of the car are beside it.
+    assert radius == pytest.approx(np.full(len(radius), 10.85), abs=0.05)
+    assert found["lap_s"] > 5
+    assert answers(cloud)["raceline"]({})["reason"] == "the page has no track"
+    narrow = Track(track.x_m, track.y_m, (0.1,) * 40, (0.1,) * 40)
+    assert "must be wider than the car" in answers(cloud, narrow)["raceline"]({})["reason"]
 
 
 def test_an_empty_range_gives_an_empty_result():

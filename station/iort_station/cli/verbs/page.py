@@ -47,16 +47,17 @@ def dashboard(
     from iort_station.page.server import PageServer, on_loopback  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
+    known = None if track is None else load_track(track)
     with PageServer(
         namespace=cloud.namespace,
         token=token,
-        answers=answers(cloud),
+        answers=answers(cloud, known),
         downloads=control.downloads(cloud),
         open_actions=actions(cloud),
         # Only people at this machine may move a robot.
         actions=control.keyed_actions(cloud) if on_loopback(host) else {},
         admitted=lambda address: say(f"another browser: {address}"),
-        track=None if track is None else load_track(track),
+        track=known,
         host=host,
         port=port,
         invitations=kept.pages(),

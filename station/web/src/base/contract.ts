@@ -329,7 +329,7 @@ export interface IncidentCounts {
   readonly counts: Readonly<Record<string, number>>;
 }
 
-/** Answers ``keep``: the robot's answer; null if it did not give one. ``reason`` says why it refused. */
+/** Answers ``keep`` and ``add_trigger``: the robot's answer; null if it did not give one. ``reason`` says why it refused. */
 export interface KeepAnswer {
   readonly accepted: boolean | null;
   readonly reason: string;
@@ -459,6 +459,49 @@ export interface StreamsAnswer {
   readonly streams: readonly string[];
 }
 
+/** The fields of a stream with numbers, by its newest samples, and those of its ``position``: x and y in metres, or latitude and longitude in ``degrees``; none without a position. */
+export interface StreamFields {
+  readonly numbers: readonly string[];
+  readonly position: readonly string[];
+  readonly degrees: boolean;
+}
+
+/** Answers ``fields``: those of each stream of a robot. */
+export interface FieldsAnswer {
+  readonly streams: Readonly<Record<string, StreamFields>>;
+}
+
+/** Answers ``raceline``: the closed line of least curvature on the page's track, and the time of a lap of the default car; without points for the ``reason`` given. */
+export interface RacelineAnswer {
+  readonly x_m: readonly number[];
+  readonly y_m: readonly number[];
+  readonly lap_s: number;
+  readonly reason: string;
+}
+
+/** A trigger that a robot's event recorder is to have: its condition, or what else fires it, beside the robot's ``answer``: "accepted", why not, or nothing yet. With ``notify`` it tells, and keeps nothing. */
+export interface TriggerEntry {
+  readonly name: string;
+  readonly stream: string;
+  readonly when: string;
+  readonly cooldown_s: number;
+  readonly notify: boolean;
+  readonly answer: string;
+}
+
+/** Answers ``triggers`` and ``remove_trigger``: those of a robot. */
+export interface TriggersAnswer {
+  readonly triggers: readonly TriggerEntry[];
+}
+
+/** Answers ``dry_run``: how often a condition became true in the ``samples`` of a range, and how many incidents would have told of it, after cooldown and merge; with the first ``times_s``. */
+export interface DryRunAnswer {
+  readonly edges: number;
+  readonly told: number;
+  readonly samples: number;
+  readonly times_s: readonly number[];
+}
+
 /** What a run recorded of a stream. ``batches`` is how many it numbered. ``samples`` is how many the agent counted, up to its last report; null without a report. */
 export interface RunPart {
   readonly from_us: number;
@@ -570,7 +613,7 @@ export interface Archived {
   readonly hours: number;
 }
 
-/** Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0 if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units. ``archive`` is null if all comes from the table. ``refused`` counts what is stored in the range and cannot be read; ``reason`` names the first by topic, time and error. */
+/** Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0 if each row is a sample. A position is that of the row's last sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units. ``archive`` is null if all comes from the table. ``refused`` counts what is stored in the range and cannot be read; ``reason`` names the first by topic, time and error. */
 export interface HistoryAnswer {
   readonly times_s: readonly number[];
   readonly fields: Readonly<Record<string, Column>>;
