@@ -7,6 +7,7 @@ A part stands between two comments. The first holds a call of a function of this
 from __future__ import annotations
 
 import html
+import inspect
 import json
 import re
 import sys
@@ -21,6 +22,7 @@ from cogapp import Cog
 from typer.cli import get_docs_for_click
 
 import iort_agent.errors
+import iort_station
 import iort_station.errors
 from bench.report import Ratio
 from bench.sections.cost import fleets
@@ -228,6 +230,30 @@ def errors() -> Iterator[Row]:
                 yield f"`{module.__name__}.{name}`", meaning
 
 
+def library() -> None:
+    """The signatures of the library's names."""
+    print("```python")
+    for name in iort_station.__all__:
+        value = getattr(iort_station, name)
+        if not inspect.isclass(value):
+            print(_signature(name, value))
+            continue
+        bases = ", ".join(base.__name__ for base in value.__bases__ if base is not object)
+        print(f"class {name}({bases}):" if bases else f"class {name}:")
+        for of, annotation in getattr(value, "__annotations__", {}).items():
+            if of[0] != "_":
+                print(f"    {of}: {getattr(annotation, '__forward_arg__', annotation)}")
+        for of, method in vars(value).items():
+            if of[0] != "_" and inspect.isfunction(method):
+                print(f"    {_signature(of, method)}")
+    print("```")
+
+
+def _signature(name: str, function: Callable[..., Any]) -> str:
+    # Annotations are texts, which `inspect` would show in quotes.
+    return re.sub(r"(: |-> )'(.*?)'(?=[,) ]|$)", r"\1\2", f"def {name}{inspect.signature(function)}")
+
+
 def cost(name: str) -> None:
     """A table of the cost model: a robot's hour, what changes if, or fleets of several sizes."""
     usage = Usage()
@@ -359,4 +385,4 @@ def _table(head: Iterable[str], body: Iterable[Iterable[str]], *, right: bool = 
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(check="--check" in sys.argv))
