@@ -12,9 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.report import Section
-from iort_agent.sources.recording.player import Message
-from iort_agent.sources.recording.rosbag import Recording, Unread
-from iort_agent.sources.recording.tool_csv import VescLog
 from iort_analysis.drives.building import build
 from iort_analysis.drives.drive import Drive
 from iort_analysis.mining.motor import RAD_S_PER_ERPM
@@ -23,6 +20,9 @@ from iort_analysis.samples.blocks import Block, column_of
 from iort_contract.catalog.car import GROUPS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.analysis import DriveKey, Estimate
+from iort_contract.recordings import Message
+from iort_contract.recordings.rosbag import Recording, Unread
+from iort_contract.recordings.tool_csv import VescLog
 from testkit import ROOT
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def streams_of(recording: AbstractContextManager[Iterator[Message]]) -> dict[str
 
 def ride(folder: Path = FOLDER) -> dict[str, Block]:
     """An electric skateboard's log of VESC Tool, 74 s."""
-    return streams_of(VescLog(folder / RIDE, VESC_STREAM, "now"))
+    return streams_of(VescLog(folder / RIDE, VESC_STREAM, original=False))
 
 
 def f1tenth(folder: Path = FOLDER) -> dict[str, Block]:

@@ -19,9 +19,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK
 from iort_agent.sources.recording import BagConfig
-from iort_agent.sources.recording.rosbag import _VESC_STATE_ROS2, VESC_TYPE
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_FIELDS
+from iort_contract.recordings.rosbag import VESC_STATE_ROS2, VESC_TYPE
 from iort_contract.ros.message import message_type, type_id
 from testkit.agent import ManualClock
 from tests.recordings import recording
@@ -161,7 +161,7 @@ def ros2_store() -> Any:
     store = get_typestore(Stores.ROS2_HUMBLE)
     state = "vesc_msgs/msg/VescState"
     # As in the driver, with the constants that the agent's own definition leaves out.
-    store.register(get_types_from_msg("int32 FAULT_CODE_NONE=0\n" + _VESC_STATE_ROS2, state))
+    store.register(get_types_from_msg("int32 FAULT_CODE_NONE=0\n" + VESC_STATE_ROS2, state))
     store.register(get_types_from_msg(f"std_msgs/Header header\n{state} state\n", VESC_TYPE))
     store.register(get_types_from_msg("float64[3] xs\nfloat32[] ys\n", "lab_msgs/msg/Odd"))
     return store

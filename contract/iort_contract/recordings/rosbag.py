@@ -13,11 +13,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Iterator, Mapping, NamedTuple, Optional, Sequence, Tuple
 
-from iort_agent.errors import SourceError
-from iort_agent.sources.recording.player import Message
-from iort_agent.sources.recording.reader import INDEX, Reader, wrapped
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
+from iort_contract.recordings import Message, RecordingError
+from iort_contract.recordings.files import INDEX, Reader, library, wrapped
+from iort_contract.recordings.scan import Scan
 from iort_contract.ros.decode import Decoder, Large, stamp_ns
 from iort_contract.ros.definition import parse
 from iort_contract.ros.message import MessageType, RosMessage, RosType
@@ -26,12 +26,13 @@ _log = logging.getLogger(__name__)
 
 VESC_TYPE = "vesc_msgs/msg/VescStateStamped"
 # A header stamp this far from the time of recording comes from a clock that is not set, or a simulation.
-_BELIEVABLE_NS = 3600 * 1_000_000_000
+BELIEVABLE_NS = 3600 * 1_000_000_000
 
 
-class _Kind(NamedTuple):
-    """The type of a topic's messages, and the sample that declares it."""
+class Kind(NamedTuple):
+    """A topic's stream, the type of its messages, and the sample that declares it."""
 
+    stream: str
     whole: RosType
     sample: Optional[Mapping[str, Value]]  # noqa: UP045 - evaluated, on Python 3.8 too
     stamped: bool
@@ -54,7 +55,7 @@ class Unread:
 
 
 class Recording:
-    """A bag, open for reading. The library's errors come as `SourceError`.
+    """A bag, open for reading. The library's errors come as `RecordingError`.
 
     ``unread`` is complete once all messages were given.
     """
@@ -67,20 +68,25 @@ class Recording:
         unread: Unread,
         *,
         large: bool = False,
+        reader: Reader | Scan | None = None,
     ) -> None:
         self._path = path
         self._topics = topics
         self._stream = stream
         self._unread = unread
         self._large = large
-        self._reader = Reader(path)
-        self._kinds: dict[_Key, _Kind] = {}
+        self._reader: Any = Reader(path) if reader is None else reader
+        self._kinds: dict[_Key, Kind] = {}
 
     def __enter__(self) -> Iterator[Message]:
+        return self._messages(self.open())
+
+    def open(self) -> Mapping[str, str]:
+        """Open the files; returns the stream of each topic that can be read. Raises `RecordingError`."""
         self._reader.open()
         try:
-            return self._messages(self._streams())
-        except SourceError:
+            return self._streams()
+        except RecordingError:
             self._reader.close()
             raise
 
@@ -88,15 +94,15 @@ class Recording:
         self._reader.close()
 
     def _streams(self) -> dict[str, str]:
-        """Wanted ROS topic -> stream, of the topics that can be read. Raises `SourceError`."""
+        """Wanted ROS topic -> stream, of the topics that can be read. Raises `RecordingError`."""
         there = {c.topic: _named(c.msgtype) for c in self._reader.connections}
         wanted = dict(self._topics or [(t, self._stream) for t, kind in there.items() if kind == VESC_TYPE])
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items())) or "no topic"
         missing = [topic for topic in wanted if topic not in there]
         if missing:
-            raise SourceError(f"{self._path}: no topic {', '.join(missing)}; the recording has {listed}")
+            raise RecordingError(f"{self._path}: no topic {', '.join(missing)}; the recording has {listed}")
         if not wanted:
-            raise SourceError(
+            raise RecordingError(
                 f"{self._path}: no topic of type {VESC_TYPE}, so `topics` must name some, such as "
                 f"`topics: {{/scan: scan}}`; the recording has {listed}"
             )
@@ -107,11 +113,11 @@ class Recording:
                 continue
             try:
                 self._kinds[_key(connection)] = self._kind(wanted[topic], connection)
-            except SourceError as error:
+            except RecordingError as error:
                 del wanted[topic]
                 self._unread.add(topic, counts[INDEX][topic], str(error))
         if not wanted:
-            raise SourceError("; ".join(self._unread.lines.values()))
+            raise RecordingError("; ".join(self._unread.lines.values()))
         for topic in wanted:
             there_by = {place: topics.get(topic, 0) for place, topics in counts.items()}
             if len(set(there_by.values())) > 1:
@@ -122,13 +128,11 @@ class Recording:
 
     def _messages(self, streams: Mapping[str, str]) -> Iterator[Message]:
         """The messages of these topics, in the order of recording."""
-        start_ns, counts = self._reader.start_ns, self._reader.counts()[INDEX]
-        read: Counter[str] = Counter()
+        start_ns = self._reader.start_ns
         begun: set[str] = set()
-        for connection, recorded_ns, raw in self._reader.messages(lambda c: c.topic in streams):
-            topic, kind, at_ns = connection.topic, self._kinds[_key(connection)], recorded_ns - start_ns
-            read[topic] += 1
-            measured_ns = self._measured_ns(raw, recorded_ns) if kind.stamped else recorded_ns
+        for kind, recorded_ns, raw in self.raw(streams):
+            at_ns = recorded_ns - start_ns
+            measured_ns = self._measured_ns(kind, raw, recorded_ns) if kind.stamped else recorded_ns
             if kind.whole.id not in begun and kind.sample is not None:
                 yield Message(TYPES_STREAM, at_ns, measured_ns, kind.sample)
             begun.add(kind.whole.id)
@@ -137,7 +141,22 @@ class Recording:
                 with suppress(MessageError):
                     values: dict[str, Any] = dict(kind.large.decode(raw))
                     contents = {name: v for name, v in values.items() if isinstance(v, Large) and v}
-            yield Message(streams[topic], at_ns, measured_ns, RosMessage(raw, kind.whole, large=contents))
+            yield Message(kind.stream, at_ns, measured_ns, RosMessage(raw, kind.whole, large=contents))
+
+    def raw(self, streams: Mapping[str, str]) -> Iterator[tuple[Kind, int, bytes]]:
+        """The messages of these topics as they are: their kind, the time of recording, and the bytes."""
+        counts, read = self._reader.counts()[INDEX], Counter()  # type: Mapping[str, int], Counter[str]
+        # The library gives one object for all messages of a connection.
+        kinds: dict[int, tuple[Any, Kind, list[int]]] = {}
+        for connection, recorded_ns, raw in self._reader.messages(lambda c: c.topic in streams):
+            known = kinds.get(id(connection))
+            if known is None:
+                # The connection, too: another object could get its id.
+                known = kinds[id(connection)] = connection, self._kinds[_key(connection)], [0]
+            known[2][0] += 1
+            yield known[1], recorded_ns, raw
+        for connection, _, (count,) in kinds.values():
+            read[connection.topic] += count
         for topic in streams:
             if read[topic] != counts[topic]:
                 self._unread.add(
@@ -147,9 +166,9 @@ class Recording:
                     f"{counts[topic]:,}",
                 )
 
-    def _kind(self, stream: str, connection: Any) -> _Kind:
+    def _kind(self, stream: str, connection: Any) -> Kind:
         name = _named(connection.msgtype)
-        kind = name if self._reader.is2 else name.replace("/msg/", "/")
+        kind = name if self._reader.ros2(connection) else name.replace("/msg/", "/")
         with wrapped(f"{self._path}: topic {connection.topic}: its type {kind} cannot be read"):
             text = self._definition(connection, name)
             definition = parse(kind, text)
@@ -161,34 +180,35 @@ class Recording:
         except ContractError as error:
             _log.warning("%s: topic %s: %s", self._path, connection.topic, error)
         large = Decoder(definition, large=True) if self._large else None
-        return _Kind(RosType(connection.topic, kind, digest, text), sample, definition.stamped(), large)
+        return Kind(
+            stream, RosType(connection.topic, kind, digest, text), sample, definition.stamped(), large
+        )
 
-    def _measured_ns(self, raw: bytes, recorded_ns: int) -> int:
+    def _measured_ns(self, kind: Kind, raw: bytes, recorded_ns: int) -> int:
         """The header stamp, or the time of recording if the stamp is missing or not believable."""
-        t_ns = stamp_ns(raw, ros2=self._reader.is2)
-        return t_ns if t_ns is not None and abs(t_ns - recorded_ns) < _BELIEVABLE_NS else recorded_ns
+        t_ns = stamp_ns(raw, ros2=kind.whole.ros2)
+        return t_ns if t_ns is not None and abs(t_ns - recorded_ns) < BELIEVABLE_NS else recorded_ns
 
     def _definition(self, connection: Any, name: str) -> str:
         """The definition as recorded, with constants and comments; of IDL, or of a type that the recording
         does not define, the library's text."""
-        from rosbags.typesys import Stores, get_types_from_idl, get_typestore  # noqa: PLC0415 - optional
-
         # rosbags for Python 3.8 has the text itself, and no format beside it.
         text: str = getattr(connection.msgdef, "data", connection.msgdef)
         form = getattr(getattr(connection.msgdef, "format", None), "name", "MSG" if text else "NONE")
         is_idl = form == "IDL" or text.startswith(_IDL)
-        if not self._reader.is2 or (form != "NONE" and not is_idl):
+        if not self._reader.ros2(connection) or (form != "NONE" and not is_idl):
             return text
-        store = get_typestore(Stores.EMPTY) if is_idl else _known_types()
+        typesys = library("typesys")
+        store = typesys.get_typestore(typesys.Stores.EMPTY) if is_idl else _known_types()
         if is_idl:
             parts = [part.partition("\n")[2] for part in text.split(_SEPARATOR)[1:]]
             for part in parts if text.startswith(_IDL) else [text]:
-                store.register(get_types_from_idl(part))
+                store.register(typesys.get_types_from_idl(part))
         # Renamed between the versions for Python 3.8 and later.
         if name not in (store.fielddefs if hasattr(store, "fielddefs") else store.FIELDDEFS):
-            raise SourceError(
+            raise RecordingError(
                 f"{self._path}: the topic {connection.topic} is of type {name}, whose definition is neither "
-                "in the recording nor known to the agent; `ros2 bag convert` into MCAP adds it"
+                "in the recording nor known; `ros2 bag convert` into MCAP adds it"
             )
         generated: str = store.generate_msgdef(name, ros_version=2)[0]
         return generated
@@ -212,7 +232,7 @@ _SEPARATOR = "=" * 80 + "\n"
 _IDL = f"{_SEPARATOR}IDL: "
 
 # vesc_msgs for ROS 2, since recordings of Foxy and Humble hold no definitions. The order is the wire's.
-_VESC_STATE_ROS2 = """
+VESC_STATE_ROS2 = """
 float64 temp_fet
 float64 temp_motor
 float64 current_motor
@@ -241,10 +261,9 @@ float64 avg_vq
 
 def _known_types() -> Any:
     """The types of ROS 2 and of the VESC driver, for recordings without definitions."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - optional
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    typesys = library("typesys")
+    store, types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE), typesys.get_types_from_msg
     state = "vesc_msgs/msg/VescState"
-    store.register(get_types_from_msg(_VESC_STATE_ROS2, state))
-    store.register(get_types_from_msg(f"std_msgs/Header header\n{state} state\n", VESC_TYPE))
+    store.register(types(VESC_STATE_ROS2, state))
+    store.register(types(f"std_msgs/Header header\n{state} state\n", VESC_TYPE))
     return store

@@ -15,10 +15,11 @@ import tempfile
 import traceback
 from collections import Counter
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Callable, Iterator, Mapping, Sequence
 
-from iort_agent.errors import SourceError
+from iort_contract.recordings import RecordingError
 
 # The first bytes of a file, its usual suffix, and its kind.
 _KINDS = (
@@ -63,17 +64,17 @@ _LONGEST = 200
 
 
 def check_kind(path: Path) -> None:
-    """Raise `SourceError` for a file whose suffix is of another kind than its content."""
+    """Raise `RecordingError` for a file whose suffix is of another kind than its content."""
     if not path.is_file():
         return
     try:
         with path.open("rb") as file:
             head = file.read(16)
     except OSError as error:
-        raise SourceError(f"{path}: cannot be opened: {error.strerror}") from error
+        raise RecordingError(f"{path}: cannot be opened: {error.strerror}") from error
     for magic, suffix, what in _KINDS:
         if head.startswith(magic) and path.suffix != suffix:
-            raise SourceError(f"{path}: is {what} by its content: rename it to {path.stem}{suffix}")
+            raise RecordingError(f"{path}: is {what} by its content: rename it to {path.stem}{suffix}")
 
 
 class TooLargeError(Exception):
@@ -82,25 +83,34 @@ class TooLargeError(Exception):
 
 @contextmanager
 def wrapped(what: str) -> Iterator[None]:
-    """Turn every error of a bag library into `SourceError`, because damaged files raise anything."""
+    """Turn every error of a bag library into `RecordingError`, because damaged files raise anything."""
     try:
         yield
-    except SourceError:
+    except RecordingError:
         raise
     except TooLargeError as error:
-        raise SourceError(f"{what.partition(': ')[0]}: {error}") from error
+        raise RecordingError(f"{what.partition(': ')[0]}: {error}") from error
     except Exception as error:
         if isinstance(error, MemoryError):
-            raise SourceError(f"{what}: a record claims to be larger than the memory") from error
+            raise RecordingError(f"{what}: a record claims to be larger than the memory") from error
         if isinstance(error, _WORDLESS):
             line = traceback.extract_tb(error.__traceback__)[-1].line
-            raise SourceError(
+            raise RecordingError(
                 f"{what}: its records do not fit together: {type(error).__name__} at `{line}`; {_COPIED}"
             ) from error
         advice = next((f"; {what}" for sign, what in _ADVICE if sign in str(error)), "")
         text = " ".join(str(error).split())
         text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
-        raise SourceError(f"{what}: {type(error).__name__}: {text}{advice}") from error
+        raise RecordingError(f"{what}: {type(error).__name__}: {text}{advice}") from error
+
+
+def library(module: str) -> Any:
+    """A module of rosbags, which the contract does not need: whoever reads bags brings it. Raises
+    `RecordingError` without it."""
+    try:
+        return import_module(f"rosbags.{module}")
+    except ImportError as error:
+        raise RecordingError(f"reading a bag needs the package rosbags: {error}") from error
 
 
 # Recorders write chunks of about a megabyte; a chunk is larger only for a message that is.
@@ -112,7 +122,7 @@ _RIHS01 = re.compile(rb"RIHS01_[0-9a-f]{64}")
 
 
 class Reader:
-    """A recording, open for reading. The library's errors come as `SourceError`."""
+    """A recording, open for reading. The library's errors come as `RecordingError`."""
 
     def __init__(self, path: Path) -> None:
         check_kind(path)
@@ -124,20 +134,12 @@ class Reader:
 
     def open(self) -> None:
         """Open all files and read their indexes."""
-        try:
-            # Only a robot that plays recordings needs the library: pip install iort-agent[bag].
-            from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - optional
-            from rosbags.rosbag2 import Reader as Reader2  # noqa: PLC0415 - optional
-        except ImportError as error:
-            raise SourceError(
-                "playing a bag needs the package rosbags: pip install 'iort-agent[bag]'"
-            ) from error
         if self.is2:
             _bound_mcap()
             if _zstd() is not None:
                 self._check_room()
         with wrapped(f"{self._path}: cannot be opened"):
-            self._reader: Any = Reader2(self._file) if self.is2 else Reader1(self._file)
+            self._reader: Any = library("rosbag2" if self.is2 else "rosbag1").Reader(self._file)
             self._reader.open()
         if not self.is2:
             _bound_bag(self._reader.chunks)
@@ -156,6 +158,12 @@ class Reader:
         return min(int(part.start_time) for part in parts)
 
     @property
+    def end_ns(self) -> int:
+        """The time of the last message."""
+        parts = (part if hasattr(part, "end_time") else part.metadata for part in self._parts)
+        return max(int(part.end_time) for part in parts) - 1
+
+    @property
     def connections(self) -> list[Any]:
         """What the library knows of each connection of the files."""
         return [connection for part in self._parts for connection in part.connections]
@@ -171,6 +179,10 @@ class Reader:
             return found.group().decode()
         same = (connection.topic, connection.msgtype)
         return next((c.digest for c in self._reader.connections if (c.topic, c.msgtype) == same), "")
+
+    def ros2(self, _connection: Any) -> bool:
+        """Whether a connection has messages of ROS 2."""
+        return self.is2
 
     def counts(self) -> Mapping[str, Mapping[str, int]]:
         """Where messages are counted -> topic -> the number of its messages."""
@@ -188,17 +200,12 @@ class Reader:
             connections = [connection for connection in part.connections if wanted(connection)]
             if not connections:
                 continue
-            iterator = iter(part.messages(connections))
-            while True:
-                with wrapped(f"{self._path}: is damaged"):
-                    message = next(iterator, None)
-                    if message is None:
-                        break
-                    connection, t_ns, raw = message
-                    # The library inflates them itself only if it reads the folder as a whole.
-                    if mode == "message" and part is not self._reader:
-                        raw = inflate("zstd", raw)
-                yield connection, t_ns, bytes(raw)
+            # The library inflates them itself only if it reads the folder as a whole.
+            inflates = mode == "message" and part is not self._reader
+            # What whoever takes a message raises does not come here.
+            with wrapped(f"{self._path}: is damaged"):
+                for connection, t_ns, raw in part.messages(connections):
+                    yield connection, t_ns, inflate("zstd", raw) if inflates else bytes(raw)
 
     def _check_room(self) -> None:
         """Refuse files that would fill the disk when the library inflates them, into a temporary folder."""
@@ -209,7 +216,7 @@ class Reader:
                 for data in inflated("zstd", iter(lambda: file.read(_READ), b"")):
                     room -= len(data)
                     if room < 0:
-                        raise SourceError(
+                        raise RecordingError(
                             f"{path}: inflates to more than half of what is free in {tempfile.gettempdir()}"
                         )
 
@@ -250,32 +257,26 @@ def _decompressor(kind: str) -> Any:
     if kind == "bz2":
         return bz2.BZ2Decompressor()
     if kind == "lz4":
-        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]  # noqa: PLC0415 - no types
-
-        return LZ4FrameDecompressor()
+        return import_module("lz4.frame").LZ4FrameDecompressor()
     return _zstd().ZstdDecompressor()
 
 
 def _zstd() -> Any:
     """The module that the library itself uses; None for Python 3.8, whose own cannot be bounded."""
-    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415 - optional
-
-    return getattr(storage_mcap, "zstd", None)
+    return getattr(library("rosbag2.storage_mcap"), "zstd", None)
 
 
 def _bound_mcap() -> None:
     """Let the library inflate the chunks of MCAP within the bound, by its table of compressions."""
-    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415 - optional
-
+    decompressors = library("rosbag2.storage_mcap").DECOMPRESSORS
     for kind in ("lz4", "zstd"):
         if kind != "zstd" or _zstd() is not None:
-            storage_mcap.DECOMPRESSORS[kind] = lambda data, _size, kind=kind: inflate(kind, data)
+            decompressors[kind] = lambda data, _size, kind=kind: inflate(kind, data)
 
 
 def _bound_bag(chunks: dict[int, Any]) -> None:
     """Let the library inflate the chunks of ROS 1 within the bound."""
-    from lz4.frame import decompress  # noqa: PLC0415 - optional
-
+    decompress = import_module("lz4.frame").decompress
     for at, chunk in chunks.items():
         for kind, unbounded in (("bz2", bz2.decompress), ("lz4", decompress)):
             if chunk.decompressor is unbounded:

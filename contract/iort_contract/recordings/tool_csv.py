@@ -16,10 +16,9 @@ from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any, Iterator, NamedTuple, Sequence
 
-from iort_agent.errors import SourceError
-from iort_agent.sources.recording.player import ORIGINAL, Message
 from iort_contract.catalog.vesc import FAULT_CODES
 from iort_contract.limits import MAX_FIELDS, Value
+from iort_contract.recordings import Message, RecordingError
 
 TIME = "ms_today"
 DAY_MS = 24 * 3600 * 1000
@@ -81,10 +80,10 @@ class _Column(NamedTuple):
 class VescLog:
     """A log: calling it opens it again, for each round of the player. The counts are those of all rounds."""
 
-    def __init__(self, path: Path, stream: str, stamps: str) -> None:
+    def __init__(self, path: Path, stream: str, *, original: bool) -> None:
         self._path = path
         self._stream = stream
-        self._stamps = stamps
+        self._original = original
         self._comma = False
         self._logged: set[str] = set()
         self._rows_read = self._clock_back = 0
@@ -112,7 +111,7 @@ class VescLog:
             # Only names of columns may be no UTF-8, and they must not stop the numbers.
             self._file = self._path.open(encoding="utf-8-sig", errors="replace")
         except OSError as error:
-            raise SourceError(f"{self._path}: cannot be opened: {error.strerror}") from error
+            raise RecordingError(f"{self._path}: cannot be opened: {error.strerror}") from error
         return self._messages()
 
     def __exit__(self, *_: object) -> None:
@@ -150,7 +149,7 @@ class VescLog:
                     )
             yield Message(self._stream, at_ms * 1_000_000, base_ns + measured_ms * 1_000_000, sample)
         if not elapsed.rows:
-            raise SourceError(f"{self._path}: it has no row that can be read")
+            raise RecordingError(f"{self._path}: it has no row that can be read")
 
     def _columns(self, labels: Sequence[str], rows: Sequence[Sequence[str]]) -> list[_Column]:
         """The columns that are fields: the contract's, and those that hold a number or nothing."""
@@ -164,7 +163,7 @@ class VescLog:
             elif label != TIME:
                 self._dropped.append(label or "(no name)")
         if len(columns) > MAX_FIELDS:
-            raise SourceError(
+            raise RecordingError(
                 f"{self._path}: {len(columns)} of its columns hold numbers, and a sample has at most "
                 f"{MAX_FIELDS} fields: take columns out of the file"
             )
@@ -232,7 +231,7 @@ class VescLog:
                 if line.strip():
                     yield number, line.strip()
         except OSError as error:
-            raise SourceError(f"{self._path}: cannot be read: {error.strerror}") from error
+            raise RecordingError(f"{self._path}: cannot be read: {error.strerror}") from error
 
     def _header(self, line: str) -> tuple[str, list[str]]:
         separator = next((sign for sign in (";", "\t", ",") if sign in line), ";")
@@ -240,21 +239,21 @@ class VescLog:
         if not labels[-1]:
             labels.pop()
         if len(labels) > _MAX_COLUMNS:
-            raise SourceError(
+            raise RecordingError(
                 f"{self._path}: it must have at most {_MAX_COLUMNS:,} columns, got {len(labels):,} or more"
             )
         if TIME not in labels:
-            raise SourceError(
+            raise RecordingError(
                 f"{self._path}: is no VESC Tool log: its first line has no column {TIME}: {line[:80]!r}"
             )
         twice = sorted(label for label, count in Counter(labels).items() if count > 1)
         if twice:
-            raise SourceError(f"{self._path}: the columns {', '.join(twice)} are there twice")
+            raise RecordingError(f"{self._path}: the columns {', '.join(twice)} are there twice")
         return separator, labels
 
     def _begin_ns(self, ms_today: int) -> int:
         """The time of the first row, in nanoseconds since the epoch; rows hold only a time of day."""
-        if self._stamps != ORIGINAL:
+        if not self._original:
             return 0
         begun = _BEGUN.search(self._path.name)
         try:
@@ -262,7 +261,7 @@ class VescLog:
         except ValueError:
             named = None
         if named is None:
-            raise SourceError(
+            raise RecordingError(
                 f"{self._path}: `stamps: original` needs the day, and rows hold only the time of day: name "
                 "the file by its start, as VESC Tool does (2024-06-12_00-34-31.csv)"
             )

@@ -4,19 +4,25 @@ ROS."""
 from __future__ import annotations
 
 import threading
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ContextManager, Iterator, Mapping, Sequence
+from typing import Any, Iterator, Mapping, NamedTuple, Optional, Sequence
 
 from iort_agent.common.schema import choice, flag, number, pairs, path, setting, text
-from iort_agent.common.threads import Clock, SystemClock
+from iort_agent.common.threads import Clock, Pace, SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, Emit, Finding, SourceConfig
-from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
-from iort_agent.sources.recording.rosbag import Recording, Unread
-from iort_agent.sources.recording.tool_csv import VescLog
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.recordings import Message, Open, RecordingError
+from iort_contract.recordings.rosbag import Recording, Unread
+from iort_contract.recordings.tool_csv import VescLog
 from iort_contract.topics import check_stream
+
+NOW, ORIGINAL = "now", "original"
+# The time between the rounds of a recording with a single message.
+_LONE_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -84,7 +90,9 @@ class BagSource:
         self._config = config
         self._clock = clock
         is_log = config.path.suffix.lower() == ".csv"
-        self._log = VescLog(config.path, config.stream, config.stamps) if is_log else None
+        self._log = (
+            VescLog(config.path, config.stream, original=config.stamps == ORIGINAL) if is_log else None
+        )
         self.unread = Unread()
 
     def report(self) -> Mapping[str, Any]:
@@ -98,19 +106,77 @@ class BagSource:
         were not read."""
         config = self._config
         how = Playback(config.speed, config.stamps, config.loop, config.duration_s)
-        play(self._recording(), how, self._clock, emit, stop)
+        with _as_source_errors():
+            play(self._recording(), how, self._clock, emit, stop)
         if self.unread.lines:
             raise SourceError("; ".join(self.unread.lines.values()))
 
-    def open(self) -> ContextManager[Iterator[Message]]:
+    @contextmanager
+    def open(self) -> Iterator[Iterator[Message]]:
         """The recording's messages, in the order of recording, for a ``with`` block. Raises `SourceError`."""
-        return self._recording()()
+        with _as_source_errors(), self._recording()() as messages:
+            yield messages
 
     def _recording(self) -> Open:
         config = self._config
         if self._log is None:
+            try:
+                # Only a robot that plays bags needs them.
+                import lz4.frame  # type: ignore[import-untyped]  # noqa: F401, PLC0415 - see above; it has no types
+                import rosbags.rosbag1  # noqa: F401, PLC0415 - as above
+            except ImportError as error:
+                raise SourceError(
+                    "playing a bag needs the package rosbags: pip install 'iort-agent[bag]'"
+                ) from error
             large = config.large == UPLOAD
             return lambda: Recording(config.path, config.topics, config.stream, self.unread, large=large)
         if config.topics is not None:
             raise SourceError(f"{config.path}: a VESC Tool log has no topics; `stream` names its stream")
         return self._log
+
+
+@contextmanager
+def _as_source_errors() -> Iterator[None]:
+    try:
+        yield
+    except RecordingError as error:
+        raise SourceError(str(error)) from error
+
+
+class Playback(NamedTuple):
+    """How to play: see `BagConfig`."""
+
+    speed: float
+    stamps: str
+    loop: bool
+    duration_s: Optional[float]  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
+
+
+def play(recording: Open, how: Playback, clock: Clock, emit: Emit, stop: threading.Event) -> None:
+    """Emit the messages until the end, or for ever with ``loop``. Raises the recording's errors."""
+    pace = Pace(clock, stop)
+    passed_ns = 0  # recorded time of the rounds before this one
+    limit_ns = None if how.duration_s is None else round(how.duration_s * 1e9)
+    base_us = clock.now_us()
+    while True:
+        with recording() as messages:
+            played, at_ns = 0, passed_ns
+            for message in messages:
+                at_ns = passed_ns + message.at_ns
+                if limit_ns is not None and at_ns >= limit_ns:
+                    return
+                if not pace.until(at_ns / 1e9 / how.speed if how.speed else 0.0):
+                    return
+                if how.stamps == ORIGINAL:
+                    t_us = (message.stamp_ns + passed_ns) // 1000
+                elif how.speed:
+                    t_us = base_us + round(at_ns / 1000 / how.speed)
+                else:
+                    t_us = clock.now_us()
+                emit(message.stream, t_us, message.values)
+                # A type comes with its first message, and is not a message.
+                played += message.stream != TYPES_STREAM
+        if not how.loop or not played:
+            return
+        # The next round begins one mean interval later, so that no two samples have one time.
+        passed_ns = at_ns + ((at_ns - passed_ns) // (played - 1) if played > 1 else _LONE_NS)
