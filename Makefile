@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-all test-heavy test-fast test-oldest mutants check setup prove-mixed prove-ros2 prove-recorder wheels bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-all test-heavy test-fast test-oldest mutants check setup prove-mixed prove-ros2 prove-recorder wheels wheelhouse release bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z0-9-]+:.*## ' Makefile | sed -E 's/^([a-z0-9-]+):.*## /\1\t/' | expand -t 14
@@ -65,8 +65,16 @@ check: setup ## run the linters, the type checkers, the links of docs/ and its g
 	@$(MAKE) --no-print-directory docs
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
 
-wheels: setup ## build the wheels of contract, agent and station into dist/
-	@$(BIN)/python -m scripts.wheels
+wheels: setup ## build the packages into dist/: wheels and sdists of contract, agent, analysis and station
+	@$(BIN)/python -m scripts.release build
+
+ARCH = aarch64 x86_64
+
+wheelhouse: setup ## build them, and for robots without a network an archive with all that the agent needs: ARCH=aarch64
+	@$(BIN)/python -m scripts.release build --wheelhouse $(ARCH)
+
+release: setup ## build, check, install and try the packages of a clean checkout: WHEELHOUSE=1 ARCH=aarch64, TAG=1 tags it here
+	@$(BIN)/python -m scripts.release release $(if $(WHEELHOUSE),--wheelhouse $(ARCH)) $(if $(TAG),--tag)
 
 prove-mixed: setup ## drive a robot of every shape of message beside rosbag record: DURATION=300
 	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/mixed/test_mixed_robot.py
@@ -141,8 +149,11 @@ lock: setup ## compile requirements/*.in to the locked *.txt
 		requirements/checkov.in -o requirements/checkov.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		requirements/docs.in -o requirements/docs.txt
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.8.10 \
+		--no-emit-package iort-agent --no-emit-package iort-contract requirements/robot.in -o requirements/robot.txt
 	@$(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --python-version 3.8.10 \
-		--no-emit-package iort-agent --no-emit-package iort-contract requirements/oldest.in -o requirements/oldest.txt
+		--no-emit-package iort-agent --no-emit-package iort-contract -c requirements/robot.txt requirements/oldest.in \
+		-o requirements/oldest.txt
 
 clean: ## remove what was made
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -18,7 +18,7 @@ else:
     setup(
         distclass=Package,
         name="iort-contract",
-        version="0.2.0",
+        version="0.3.0",
         packages=find_packages(include=["iort_contract*"]),
         package_data={"iort_contract": ["py.typed"]},
         data_files=[

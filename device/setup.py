@@ -18,7 +18,7 @@ else:
     setup(
         distclass=Package,
         name="iort-agent",
-        version="0.2.0",
+        version="0.3.0",
         packages=find_packages(include=["iort_agent*"]),
         package_data={"iort_agent": ["py.typed"]},
         data_files=[

@@ -1,0 +1,106 @@
+"""scripts/release.py: one version for all parts, and which commits are no release."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from scripts import release
+from scripts.release import ReleaseError
+from testkit import ROOT
+
+
+def git(folder: Path, *arguments: str) -> str:
+    named = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+    command = ["git", "-C", str(folder), *named, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A clean checkout that states the versions of the real one, 1.2.3, and has it in its changelog."""
+    for path in release.versions():
+        copy = tmp_path / path.relative_to(ROOT)
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copy(path, copy)
+    release.set_version("1.2.3", tmp_path)
+    (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## 1.2.3 - 2026-01-02\n\n## 1.2.2 - 2026-01-01\n")
+    git(tmp_path, "init", "--quiet")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "--quiet", "--message", "first")
+    return tmp_path
+
+
+def test_every_part_states_the_same_version() -> None:
+    stated = release.versions()
+    # Each states its own, and that of each part that it needs.
+    assert {path.relative_to(ROOT).as_posix(): len(found) for path, found in stated.items()} == {
+        "contract/pyproject.toml": 1, "contract/package.xml": 1, "contract/setup.py": 1,
+        "device/pyproject.toml": 2, "device/package.xml": 1, "device/setup.py": 1,
+        "analysis/pyproject.toml": 2, "station/pyproject.toml": 3,
+    }  # fmt: skip
+    assert {number for found in stated.values() for number in found} == {release.version()}
+    assert {version(f"iort-{part}") for part in ("contract", "agent", "analysis", "station")} == {
+        release.version()
+    }
+
+
+def test_the_changelog_begins_with_the_version() -> None:
+    first = re.search(r"(?m)^## (\S+) - (\d{4}-\d\d-\d\d|unreleased)$", (ROOT / "CHANGELOG.md").read_text())
+    assert first is not None
+    assert first[1] == release.version()
+
+
+def test_a_version_is_set_everywhere(checkout: Path) -> None:
+    release.set_version("10.0.2", checkout)
+    assert {number for found in release.versions(checkout).values() for number in found} == {"10.0.2"}
+    assert release.version(checkout) == "10.0.2"
+    # Nothing else has changed: back, and it is as it was.
+    release.set_version("1.2.3", checkout)
+    assert git(checkout, "status", "--porcelain") == ""
+
+
+def test_a_version_that_is_none_is_refused(checkout: Path) -> None:
+    with pytest.raises(ReleaseError, match=r"must be three numbers such as 1\.2\.3, got '1\.2'"):
+        release.set_version("1.2", checkout)
+
+
+def test_a_clean_checkout_with_a_changelog_is_a_release(checkout: Path) -> None:
+    release.refuse(checkout, tag=True)
+
+
+def test_a_change_that_is_not_committed_is_refused(checkout: Path) -> None:
+    (checkout / "new").touch()
+    with pytest.raises(ReleaseError, match=r"must have no change that is not committed, got\n\?\? new"):
+        release.refuse(checkout)
+
+
+@pytest.mark.parametrize("heading", ["1.2.3 - unreleased", "1.2.4 - 2026-01-02", "1.2.3"])
+def test_a_changelog_without_the_version_and_a_date_is_refused(checkout: Path, heading: str) -> None:
+    (checkout / "CHANGELOG.md").write_text(f"# Changelog\n\n## {heading}\n")
+    git(checkout, "commit", "--quiet", "--all", "--message", "changelog")
+    with pytest.raises(ReleaseError, match=rf"'## 1\.2\.3 - DATE', got '## {heading}' first"):
+        release.refuse(checkout)
+
+
+def test_a_tagged_version_is_built_again_from_its_own_commit_alone(checkout: Path) -> None:
+    git(checkout, "tag", "--annotate", "v1.2.3", "--message", "1.2.3")
+    release.refuse(checkout)
+    with pytest.raises(ReleaseError, match=r"1\.2\.3 must not be tagged yet"):
+        release.refuse(checkout, tag=True)
+    git(checkout, "commit", "--quiet", "--allow-empty", "--message", "second")
+    with pytest.raises(
+        ReleaseError, match=r"set the next version with `python -m scripts\.release version NUMBER`"
+    ):
+        release.refuse(checkout)
+
+
+def test_a_folder_that_is_no_checkout_is_refused(checkout: Path) -> None:
+    shutil.rmtree(checkout / ".git")
+    with pytest.raises(ReleaseError, match="must succeed, got: fatal: not a git repository"):
+        release.refuse(checkout)
