@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import Counter
 from collections.abc import Generator, Iterator
 from functools import lru_cache
 from importlib.util import find_spec
@@ -115,13 +116,18 @@ def services_read_once() -> Iterator[None]:
         yield
 
 
+# What no registry has, or only with 8 GB of packages: the reason of a test that is skipped without it.
+NO_LEROBOT = "IORT_LEROBOT names no Python that has lerobot"
+LEFT_OUT = {"ROS 2": ABSENT, "LeRobot": NO_LEROBOT}
+
+
 def skips_fail() -> bool:
     return os.environ.get("REQUIRE_ALL", "").lower() in {"1", "true", "yes"}
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport() -> Generator[None, Any, Any]:
-    """REQUIRE_ALL=1: a complete machine has no reason to skip a test, except that it has no ROS 2."""
+    """REQUIRE_ALL=1: a complete machine has no reason to skip a test, except for what `LEFT_OUT` names."""
     report = yield
     return failed_if_skipped(report)
 
@@ -134,25 +140,27 @@ def pytest_make_collect_report() -> Generator[None, Any, Any]:
 
 def failed_if_skipped(report: Any) -> Any:
     # An expected failure is reported as skipped, but is not a skip.
-    if report.skipped and skips_fail() and not hasattr(report, "wasxfail") and not without_ros2(report):
+    if report.skipped and skips_fail() and not hasattr(report, "wasxfail") and not left_out(report):
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
         report.outcome = "failed"
         report.longrepr = f"REQUIRE_ALL is set, and this was skipped: {reason}"
     return report
 
 
-def without_ros2(report: Any) -> bool:
-    return ABSENT in str(report.longrepr)
+def left_out(report: Any) -> str:
+    """What the machine lacks for a skipped test, of `LEFT_OUT`; empty for any other reason."""
+    return next((name for name, reason in LEFT_OUT.items() if reason in str(report.longrepr)), "")
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Say in the last line what no package registry lets CI test."""
+    """Say in the last lines what CI cannot test."""
     reporter = config.pluginmanager.getplugin("terminalreporter")
-    count = sum(map(without_ros2, reporter.getreports("skipped"))) if reporter else 0
-    if count:
-        tests = "1 test" if count == 1 else f"{count} tests"
-        reporter.write_line(f"ROS 2: {tests} left out, since {ABSENT}")
+    counts = Counter(map(left_out, reporter.getreports("skipped"))) if reporter else Counter()
+    for name, reason in LEFT_OUT.items():
+        if counts[name]:
+            tests = "1 test" if counts[name] == 1 else f"{counts[name]} tests"
+            reporter.write_line(f"{name}: {tests} left out, since {reason}")
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from iort_station.errors import StationError
 
@@ -44,6 +45,26 @@ def whole(path: Path, *, force: bool = False) -> Iterator[Path]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path, mark: str, kind: str, *, force: bool = False) -> Iterator[Path]:
+    """The same for a folder, which must not exist yet when the block writes it.
+
+    ``mark`` is a file that every ``kind`` has: ``force`` replaces no other folder.
+    """
+    check_free(path, force=force)
+    if path.exists() and not (path / mark).is_file():
+        raise StationError(f"{path} is no {kind}: give another --out")
+    if not path.parent.is_dir():
+        raise StationError(f"{path} must be in a folder that exists")
+    with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as temporary:
+        # Files in it may have its name.
+        part = Path(temporary) / path.name
+        yield part
+        if path.exists():
+            path.rename(Path(temporary) / "before")
+        part.rename(path)
 
 
 def write_private(path: Path, content: str | bytes) -> None:

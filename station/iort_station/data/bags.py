@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple, Protocol
 
 from mcap.writer import Writer as McapWriter
@@ -21,7 +20,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 from iort_contract.ros.message import MessageType
 from iort_station.data.ros_forms import Form, form_of, from_ros2
 from iort_station.errors import StationError
-from iort_station.output import check_free, whole
+from iort_station.output import whole, whole_folder
 
 Write = Callable[[int, bytes], None]
 
@@ -190,19 +189,12 @@ def _start(writer: McapWriter, profile: str) -> None:
 def folder(path: Path, *, force: bool = False) -> Iterator[Recording]:
     """A new folder of ROS 2 with an SQLite database, which appears once it is whole. Raises `StationError` if
     it exists; with ``force``, if it is something else than such a folder."""
-    check_free(path, force=force)
-    if path.exists() and not (path / "metadata.yaml").is_file():
-        raise StationError(f"{path} is no recording of ROS 2: give another --out")
-    if not path.parent.is_dir():
-        raise StationError(f"{path} must be in a folder that exists")
-    with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as temporary:
-        # The files in it have its name. Humble reads this version, as all after it do.
-        part = Path(temporary) / path.name
-        with FolderWriter(part, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
-            yield _Folder(writer)
-        if path.exists():
-            path.rename(Path(temporary) / "before")
-        part.rename(path)
+    # Humble reads this version, as all after it do.
+    with (
+        whole_folder(path, "metadata.yaml", "recording of ROS 2", force=force) as part,
+        FolderWriter(part, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer,
+    ):
+        yield _Folder(writer)
 
 
 KINDS = {".bag": bag, ".mcap": mcap, "": folder}

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
@@ -84,6 +85,21 @@ def lab_bag(path: Path) -> Path:
     return path
 
 
+def _becomes_a_dataset(cloud, robot, iort, dataset):
+    learning = ["export", robot, "--format", "lerobot", "--last", "all", "--out", str(dataset)]
+    done = iort(*learning)
+    assert "has no analysed drives in this range: run `iort analyse`" in str(done.exception)
+    done = iort(*learning, "--episodes", "runs", "--fps", "50")
+    assert done.exit_code == 0, done.output
+    assert "action: servo.data" in done.stderr
+    recorded = data.query(cloud, robot, "vesc", fields=["current_motor"]).columns["current_motor"]
+    frames = pq.read_table(dataset / "data").to_pydict()
+    currents = [row[1] for row in frames["observation.state"]]
+    assert set(currents) <= set(recorded.astype(np.float32).tolist())
+    assert len(set(currents)) > 300
+    assert len(frames["action"]) == frames["index"][-1] + 1 > 1000
+
+
 @pytest.mark.timeout(300)
 def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, iort, tmp_path):
     original, lab = recording("f1tenth-motor-servo.bag"), lab_bag(tmp_path / "lab.bag")
@@ -123,6 +139,8 @@ def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, iort, tmp_pat
         assert len(came) == count
         stamps = [recorded_ns if topic == SERVO else stamp_ns(raw) for recorded_ns, raw in went]
         assert [t_ns for t_ns, _ in came] == [stamp // 1000 * 1000 for stamp in stamps]
+
+    _becomes_a_dataset(embedded.cloud, robot.robot, iort, tmp_path / "dataset")
 
     mcap = tmp_path / "again.mcap"
     done = iort(*asked, str(mcap))

@@ -28,7 +28,7 @@ VERBS = {
     "streams": ("runs", "List a robot's streams: fields, runs, times."),
     "runs": ("runs", "List the runs of a robot's agent."),
     "query": ("samples", "Print recorded samples."),
-    "export": ("samples", "Write a recording: MCAP, a ROS 1 bag or a folder of ROS 2."),
+    "export": ("samples", "Write a recording: MCAP, a bag, or a dataset to learn from."),
     "plot": ("samples", "Draw recorded samples."),
     "laps": ("laps", "List laps: time, distance, energy, and compare two."),
     "analyse": ("analysis", "Analyse robots' drives in the cloud, now."),

@@ -29,6 +29,8 @@ from iort_station.cli.options import (
     option,
     ranged,
 )
+from iort_station.cli.verbs.lerobot import Learning, learned
+from iort_station.cli.verbs.lerobot import export as dataset
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
@@ -182,15 +184,22 @@ _BOOKKEEPING = {ACCOUNT_STREAM, TYPES_STREAM}
         "export car7 vesc --last 10m --out car7.mcap",
         "export car7 --last 10m --out all.mcap",
         "export car7 --last 10m --out ride/",
+        "export car7 --format lerobot --last 30d --cameras camera --out dataset/",
     ),
 )
+@learned
 @ranged
 def export(
     context: typer.Context,
     robot: Robot,
     when: When,
+    learning: Learning,
     out: Annotated[Path, option("The file to write: .mcap, .bag, or a folder of ROS 2.", "--out", "-o")],
     streams: Annotated[list[str] | None, argument("The streams, for example vesc. Default: all.")] = None,
+    form: Annotated[
+        Literal["lerobot"] | None,
+        option("Write a dataset for learning. Default: what --out is.", "--format"),
+    ] = None,
     ros2: Annotated[bool, option("Write messages of ROS 1 as ROS 2's.", "--ros2")] = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -202,7 +211,17 @@ def export(
     has those of ROS 2 in ROS 1's form; a folder, or an MCAP with --ros2, has those of ROS 1 in ROS 2's, which
     loses the seq of headers. Other samples (of a simulated car, a serial line, a selection of fields) become
     messages of the type that their source gave, or of their fields. For CSV and Parquet, use iort query.
+
+    With --format lerobot, drives, runs or incidents become episodes of a dataset of LeRobot 3.0: state and
+    action at even steps, cameras as videos.
     """
+    if form is not None:
+        if streams or ros2 or out.suffix:
+            raise UsageError("--format lerobot writes a folder: give neither streams, --ros2 nor an ending")
+        dataset(context.obj.cloud(), robot, when.range(), out, learning, force=force, as_json=as_json)
+        return
+    if learning.given:
+        raise UsageError("--episodes, --state, --action, --cameras, --fps and --task need --format lerobot")
     # numpy takes longer to load than most commands to run.
     from iort_analysis.archive.stored import Origin  # noqa: PLC0415 - as above
     from iort_station.data import bags  # noqa: PLC0415 - as above

@@ -99,6 +99,8 @@ def _files(tmp_path, monkeypatch):
         (["export", "car", "vesc", "--out", "ride.mcap"], 1, "ride.mcap exists: give another --out"),
         (["export", "car", "--out", "ride.db3"], 2, "must end in .bag or .mcap, and a folder in nothing"),
         (["export", "car", "--ros2", "--out", "a.bag"], 2, "--ros2 needs an .mcap or a folder"),
+        (["export", "car", "--fps", "20", "--out", "a"], 2, "--fps and --task need --format lerobot"),
+        (["export", "car", "--format", "lerobot", "--out", "a.mcap"], 2, "lerobot writes a folder"),
         (["plot", "car", "vesc", "--out", "ride.png"], 1, "ride.png exists: give another --out"),
         (["robots", "claim", "car", "--out", "."], 1, "claim.yaml exists: give another --out"),
     ],
