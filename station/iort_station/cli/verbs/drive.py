@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import os
-import queue
 import re
-import secrets
 import select
 import sys
 import termios
-import time
 import tty
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,33 +17,18 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from iort_contract.cloud import DRIVER
-from iort_contract.limits import LIVE_MAX_RATE_HZ, ContractError
 from iort_contract.messages.commands import (
     DRIVE_MAX_AGE_MS,
     DRIVE_MAX_RTT_MS,
-    DRIVE_RATE_HZ,
-    DriveLimits,
-    encode_command,
 )
-from iort_contract.messages.live import (
-    VIEW_LEASE_MS,
-    VIEW_RENEW_S,
-    Lease,
-    decode_live,
-    encode_lease,
-    lease_topic,
-)
-from iort_contract.topics import CMD, LIVE, build_topic, parse_topic
 from iort_station.cli.console import out
 from iort_station.cli.options import Robot, examples, option
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
-from iort_station.fleet import registry, stopping
-from iort_station.fleet.broker import Broker
+from iort_station.fleet import stopping
 from iort_station.fleet.control import operator
 from iort_station.fleet.driving import Driver, Phase, Stick
-from iort_station.fleet.roles import Role
+from iort_station.fleet.seat import TICK_US, Seat, limits_of, monotonic_us
 
 # The keys of `iort drive` as a stick with a dead man's switch.
 #
@@ -137,7 +119,6 @@ class Keys:
 
 
 commands = typer.Typer()
-_TICK_US = round(1e6 / DRIVE_RATE_HZ)
 _SHOWN_US = 100_000
 _USUAL_MPS = 1.0
 _FASTER = 1.25
@@ -161,7 +142,7 @@ def drive(
     if not (sys.stdin.isatty() and out.is_terminal):
         raise UsageError("iort drive needs a terminal with a keyboard")
     cloud = context.obj.cloud()
-    limits = _limits(cloud, robot)
+    limits = limits_of(cloud, robot)
     top_mps = min(max_speed or _USUAL_MPS, limits.max_speed_mps)
     seat = _Seat(cloud, robot, Driver(limits, by or operator(), top_mps))
     with seat.broker, _raw_keys(), Live(console=out, auto_refresh=False, transient=True) as live:
@@ -173,58 +154,28 @@ def drive(
             seat.leave()
 
 
-def _limits(cloud: Cloud, robot: str) -> DriveLimits:
-    registry.get(cloud, robot)
-    found = stopping.motion(cloud, [robot])[robot]
-    if found.drive is None:
-        raise StationError(
-            f"{robot} cannot be driven: its car.yaml has no downlink.drive, or it has not run since"
-        )
-    if found.asked:
-        raise StationError(f"{robot} is stopped: `iort stop {robot} --release` lets it move again")
-    return found.drive
-
-
-class _Seat:
-    """One driver, one car, and the broker between them."""
+class _Seat(Seat):
+    """A seat with the keys of this terminal."""
 
     def __init__(self, cloud: Cloud, robot: str, driver: Driver) -> None:
-        self._urgent, self._robot, self._driver = cloud.urgent(), robot, driver
-        self._namespace = cloud.namespace
+        super().__init__(cloud, robot, driver)
+        self._urgent = cloud.urgent()
         self._keys, self._begun = Keys(), ""
-        self._heard: queue.SimpleQueue[tuple[str, bytes, int]] = queue.SimpleQueue()
-        self._topic = build_topic(CMD, robot, driver.limits.command, cloud.namespace)
-        self._lease = encode_lease(Lease(secrets.token_hex(8), LIVE_MAX_RATE_HZ, VIEW_LEASE_MS, broker=True))
-        self._viewed_us = -int(VIEW_RENEW_S * 1e6)
         self._stop_asked = False
-        self.broker = Broker(
-            cloud,
-            Role(cloud, DRIVER),
-            filters=[f"{LIVE}/{cloud.namespace}/{robot}/+"],
-            on_message=lambda topic, message: self._heard.put((topic, message, _now_us())),
-        )
 
     def run(self, live: Live) -> None:
         """Drive until the driver quits."""
-        due_us = shown_us = _now_us()
-        while self._take_keys(max(0, due_us - _now_us()) / 1e6):
-            now_us = _now_us()
+        due_us = shown_us = monotonic_us()
+        while self._take_keys(max(0, due_us - monotonic_us()) / 1e6):
+            now_us = monotonic_us()
             if now_us < due_us:
                 continue
             # After a pause of this process, what was due is not made up for.
-            due_us = max(due_us + _TICK_US, now_us)
+            due_us = max(due_us + TICK_US, now_us)
             self._tick(now_us)
             if now_us >= shown_us:
                 shown_us = now_us + _SHOWN_US
                 live.update(self._shown(now_us), refresh=True)
-
-    def leave(self) -> None:
-        """Have the car stop."""
-        self._keys.let_go()
-        self._driver.leave()
-        while (command := self._driver.tick(_now_us())) is not None:
-            self.broker.publish(self._topic, encode_command(command))
-            time.sleep(_TICK_US / 1e6)
 
     def _take_keys(self, wait_s: float) -> bool:
         """Wait for keys, and take them; False to quit."""
@@ -233,15 +184,15 @@ class _Seat:
         if readable and not text:
             return False  # the terminal has closed
         keys, self._begun = keys_of(self._begun + text)
-        self._keys.arrived(keys, _now_us())
+        self._keys.arrived(keys, monotonic_us())
         for key in keys:
             if key == "q":
                 return False
-            self._press(key, _now_us())
+            self._press(key, monotonic_us())
         return True
 
     def _press(self, key: str, now_us: int) -> None:
-        driver = self._driver
+        driver = self.driver
         if self._keys.press(key, now_us):
             return
         if key == " ":
@@ -260,32 +211,16 @@ class _Seat:
         self._keys.let_go()
         # The broker is faster than the shadow.
         self._tick(now_us)
-        failed = stopping.stop(self._urgent, [self._robot], by=self._driver.by)
+        failed = stopping.stop(self._urgent, [self._robot], by=self.driver.by)
         if failed:
             raise StationError(f"the emergency stop of {self._robot} has failed: {failed[self._robot]}")
         self._stop_asked = True
 
     def _tick(self, now_us: int) -> None:
-        while not self._heard.empty():
-            self._take(*self._heard.get())
-        if now_us - self._viewed_us >= VIEW_RENEW_S * 1e6:
-            self._viewed_us = now_us
-            self.broker.publish(lease_topic(self._robot, self._namespace), self._lease)
-        driver = self._driver
-        driver.hold(held=self._keys.held(now_us), now_us=now_us)
-        driver.stick = self._keys.stick(now_us)
-        command = driver.tick(now_us)
-        if command is not None:
-            self.broker.publish(self._topic, encode_command(command))
-
-    def _take(self, topic: str, message: bytes, now_us: int) -> None:
-        try:
-            self._driver.hear(parse_topic(topic).name, decode_live(message), now_us)
-        except ContractError:
-            return  # the rules quarantine it
+        self.tick(held=self._keys.held(now_us), stick=self._keys.stick(now_us), now_us=now_us)
 
     def _shown(self, now_us: int) -> Table:
-        driver = self._driver
+        driver = self.driver
         rows = Table(box=None, show_header=False, pad_edge=False)
         rows.add_column(style="dim")
         rows.add_column()
@@ -327,10 +262,6 @@ def _ms(us: int | None, most: int) -> Text:
     if us is None:
         return Text("-")
     return Text(f"{us / 1000:.0f} ms", style="red" if us > most * 1000 else "")
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000
 
 
 @contextmanager
