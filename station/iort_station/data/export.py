@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing
+from itertools import chain
 from typing import NamedTuple
 
 from iort_analysis.archive.hours import key_of
 from iort_analysis.archive.stored import Origin, PageProgress
-from iort_analysis.samples.batches import Item, RefusedItems
+from iort_analysis.samples.batches import Item, RefusedItems, start_us
 from iort_contract.codec import ROS2_CODEC
 from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.limits import ContractError
@@ -61,10 +63,28 @@ class Export:
 
     def messages(self, progress: PageProgress | None = None) -> Iterator[Published]:
         """The messages, in order of their batches' times."""
+        for item in chain.from_iterable(self._pages(progress)):
+            yield from self._of(item)
+
+    def first(self) -> list[Published]:
+        """The messages of the first page."""
+        with closing(self._pages(None)) as pages:
+            return [one for item in next(pages, ()) for one in self._of(item)]
+
+    def in_order(self, progress: PageProgress | None = None) -> Generator[Published, None, None]:
+        """The messages in order of their own times: batches may overlap."""
+        held: list[Published] = []
+        for item in chain.from_iterable(self._pages(progress)):
+            # A later batch may still hold messages from its start on.
+            final_us = start_us(item)
+            yield from (one for one in held if one.t_us < final_us)
+            held = [one for one in held if one.t_us >= final_us] + list(self._of(item))
+            held.sort(key=lambda one: one.t_us)
+        yield from held
+
+    def _pages(self, progress: PageProgress | None) -> Generator[Sequence[Item], None, None]:
         keys = with_samples_between(self._selection.start_us, self._selection.end_us)
-        for items in self._recorded.items(keys, progress=progress):
-            for item in items:
-                yield from self._of(item)
+        yield from self._recorded.items(keys, progress=progress)
 
     def _of(self, item: Item) -> Sequence[Published]:
         try:

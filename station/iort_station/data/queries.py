@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import TYPE_CHECKING, cast
@@ -202,7 +202,7 @@ def samples(
     messages: bool = True,
     scan: bool = False,
     progress: PageProgress | None = None,
-) -> Iterator[Block]:
+) -> Generator[Block, None, None]:
     """The selection's samples block by block, for ranges that do not fit in memory.
 
     ``absent`` counts values by field that became null because their sensor is not fitted; without it they

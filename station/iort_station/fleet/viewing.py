@@ -46,7 +46,8 @@ class Viewer:
     """Holds a lease of each robot within a ``with`` block, in a thread of its own.
 
     ``robots`` are names, or a function that is asked at each renewal. ``broker`` says that the viewer listens
-    at the broker, not at PubNub. It renews ``every_s``, which also wakes a robot that has just come.
+    at the broker, not at PubNub. It renews ``every_s``, which also wakes a robot that has just come, and
+    whenever somebody calls `renew`.
     `problem` says why the last renewal failed, for who may look but not wake.
     """
 
@@ -64,6 +65,7 @@ class Viewer:
         self._lease = Lease(secrets.token_hex(8), rate_hz, VIEW_LEASE_MS, broker)
         self._every_s = every_s
         self._held: set[str] = set()
+        self._renewing = threading.Lock()
         self._end = threading.Event()
         self._thread = threading.Thread(
             target=lambda: keep("viewer", self._run, self._end), name="viewer", daemon=True
@@ -71,7 +73,7 @@ class Viewer:
         self.problem = ""
 
     def __enter__(self) -> Self:
-        self._renew()
+        self.renew()
         self._thread.start()
         return self
 
@@ -88,17 +90,19 @@ class Viewer:
 
     def _run(self) -> None:
         while not self._end.wait(self._every_s):
-            self._renew()
+            self.renew()
 
-    def _renew(self) -> None:
-        try:
-            robots = set(self._robots())
-        except (StationError, BotoCoreError, ClientError) as error:
-            self.problem = str(error)
-            return
-        self._publish(self._held - robots, 0)
-        self._held = robots
-        self._publish(robots, VIEW_LEASE_MS)
+    def renew(self) -> None:
+        """Renew the leases now, and end those of robots that are no longer looked at."""
+        with self._renewing:
+            try:
+                robots = set(self._robots())
+            except (StationError, BotoCoreError, ClientError) as error:
+                self.problem = str(error)
+                return
+            self._publish(self._held - robots, 0)
+            self._held = robots
+            self._publish(robots, VIEW_LEASE_MS)
 
     def _publish(self, robots: set[str], lease_ms: int) -> None:
         lease = Lease(self._lease.viewer, self._lease.rate_hz, lease_ms, self._lease.broker)

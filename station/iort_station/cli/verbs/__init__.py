@@ -30,6 +30,7 @@ VERBS = {
     "query": ("samples", "Print recorded samples."),
     "export": ("samples", "Write a recording: MCAP, a bag, or a dataset to learn from."),
     "plot": ("samples", "Draw recorded samples."),
+    "bridge": ("bridge", "Serve robots, live or past, for Foxglove and PlotJuggler."),
     "laps": ("laps", "List laps: time, distance, energy, and compare two."),
     "analyse": ("analysis", "Analyse robots' drives in the cloud, now."),
     "findings": ("analysis", "List what the analysis found about drives."),

@@ -10,7 +10,7 @@ from typer.core import TyperGroup
 
 from iort_contract.messages.recorder import LOST, OVER_BUDGET, UPLOADED, Incident
 from iort_station.cli import options
-from iort_station.cli.console import errors, listing, out, table
+from iort_station.cli.console import bar, errors, listing, out, table
 from iort_station.cli.options import AsJson, Force, OneRobot, When, argument, examples, option, ranged
 from iort_station.cli.verbs.files import fetch
 from iort_station.cloud import Cloud
@@ -98,6 +98,16 @@ def get(
         errors.print("no uploaded incidents in this range", soft_wrap=True)
     if gone := [one.incident.id for one, file in stored if file is None]:
         raise StationError(f"not in the bucket any more: {', '.join(gone)}")
+
+
+def downloaded(cloud: Cloud, id_: str, folder: Path) -> Path:
+    """The file of one incident, downloaded into a folder; raises `StationError` if there is none."""
+    one = _one(_found(cloud, None, options.Range(None, None)), id_)
+    file = _stored(cloud, one)
+    if file is None:
+        raise StationError(f"the file of incident {id_} is not in the bucket any more")
+    with bar(file.name, file.size) as progress:
+        return files.download(cloud, file, folder, progress)
 
 
 def _found(cloud: Cloud, robot: str | None, within: options.Range) -> list[RobotIncident]:
