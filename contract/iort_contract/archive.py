@@ -9,6 +9,7 @@ import hashlib
 import json
 import re
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from typing import Any, Iterable, Iterator, Mapping, NamedTuple
@@ -143,10 +144,55 @@ def archived_hour(item: Mapping[str, Any]) -> ArchivedHour:
 
 
 class ArchiveTable(TopicTable):
-    """The archive's manifest, by topic and hour."""
+    """The archive's manifest, by topic and hour; and its pending rows."""
 
     def __init__(self, client: Any, name: str) -> None:
         super().__init__(client, name, HOUR)
+
+    def row(self, topic: str, hour: Hour) -> ArchivedHour | None:
+        """An hour's row; raises `ContractError` if it is damaged."""
+        key = {TOPIC: {"S": topic}, HOUR: {"S": str(hour)}}
+        answer = self._client.get_item(TableName=self.name, Key=key, ConsistentRead=True)
+        return archived_hour(answer["Item"]) if "Item" in answer else None
+
+    def keep(self, row: ArchivedHour, before: ArchivedHour | None) -> None:
+        """Write a row, if the hour still has the content from before; raises the client's error if not."""
+        unchanged: dict[str, Any] = {"ConditionExpression": "attribute_not_exists(content)"}
+        if before is not None:
+            unchanged = {
+                "ConditionExpression": "content = :content",
+                "ExpressionAttributeValues": {":content": {"S": before.content}},
+            }
+        self._client.put_item(TableName=self.name, Item=row.item(), **unchanged)
+
+    def mark(self, pending: Pending, now_ms: int) -> int:
+        """Mark what is to be done, or move its mark to a later time; returns when it is due."""
+        due_ms = pending.due_ms(now_ms)
+        # A row with a later time stays.
+        self.change(
+            pending,
+            "SET #due = :due, #first = if_not_exists(#first, :due)",
+            "attribute_not_exists(#due) OR #due < :due",
+            due=due_ms,
+        )
+        return due_ms
+
+    def change(self, pending: Pending, change: str, condition: str, **values: int) -> None:
+        """Change a mark if the condition holds."""
+        names = {"#due": DUE_MS, "#first": FIRST_DUE_MS}
+        more: dict[str, Any] = {}
+        if values:
+            numbers = {f":{name}": {"N": str(value)} for name, value in values.items()}
+            more["ExpressionAttributeValues"] = numbers
+        with suppress(self._client.exceptions.ConditionalCheckFailedException):
+            self._client.update_item(
+                TableName=self.name,
+                Key=pending.key,
+                UpdateExpression=change,
+                ConditionExpression=condition,
+                ExpressionAttributeNames={k: v for k, v in names.items() if k in change + condition},
+                **more,
+            )
 
 
 def hours_between(first: Hour | None, last: Hour | None) -> Keys:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from functools import lru_cache
 from typing import NamedTuple
@@ -113,3 +114,28 @@ def as_subscribed(topic: str, rule: str) -> str:
 def rule_name(rule: str, namespace: str = DEFAULT_NAMESPACE) -> str:
     """The physical name of a topic rule; robots need two of them for Basic Ingest."""
     return f"{check_namespace(namespace)}_{checked(_RULE, rule, 'rule', 'up to 32 lower-case letters')}"
+
+
+# Streams that are named after ROS topics.
+
+MAX_STREAM = 64
+
+
+def stream_of(topic: str) -> str:
+    """The stream of a topic that names none. No two topics have the same: `-` is in no topic's name."""
+    name = topic.strip("/").replace("/", "-")
+    if len(name) > MAX_STREAM:
+        digest = hashlib.sha256(topic.encode()).hexdigest()[:8]
+        name = f"{name[: MAX_STREAM - 9]}-{digest}"
+    return name
+
+
+def matches(pattern: str, topic: str) -> bool:
+    """Whether a topic fits a pattern. Hidden topics, whose names have a part that begins with `_`, fit
+    none."""
+    return "/_" not in topic and _compiled(pattern).fullmatch(topic) is not None
+
+
+@lru_cache(maxsize=256)
+def _compiled(pattern: str) -> re.Pattern[str]:
+    return re.compile(".*".join(map(re.escape, pattern.split("*"))))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import heapq
 import logging
 from collections.abc import Iterable, Iterator
@@ -10,8 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
-from tempfile import TemporaryFile
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 from botocore.exceptions import BotoCoreError, ClientError
 
@@ -20,25 +18,22 @@ from functions.shared.clients import variables
 from functions.shared.quotas import RateLimiter
 from iort_contract.archive import (
     DUE_MS,
-    FIRST_DUE_MS,
     HOUR,
     PENDING,
     ArchivedHour,
     ArchiveTable,
     Hour,
     Pending,
-    archived_hour,
     hour_of,
     parse_pending,
 )
 from iort_contract.catalog.environments import ArchiveEnvironment
 from iort_contract.dynamodb import Item, TelemetryTable, quick
-from iort_contract.tables import TOPIC
+from iort_contract.objects import Objects
 from iort_contract.topics import parse_topic
 
 if TYPE_CHECKING:
     from types_boto3_dynamodb import DynamoDBClient
-    from types_boto3_s3 import S3Client
     from types_boto3_sqs import SQSClient
 
 
@@ -86,15 +81,7 @@ class Marks:
 
     def add(self, pending: Pending, now_ms: int) -> int:
         """Mark one, or move its mark to a later time; returns when it is due."""
-        due_ms = pending.due_ms(now_ms)
-        # A row with a later time stays.
-        self._update(
-            pending,
-            "SET #due = :due, #first = if_not_exists(#first, :due)",
-            "attribute_not_exists(#due) OR #due < :due",
-            due=due_ms,
-        )
-        return due_ms
+        return ArchiveTable(self._client, self._table).mark(pending, now_ms)
 
     def due_ms(self, pending: Pending) -> int | None:
         """When one is due; None if it has no mark."""
@@ -133,91 +120,7 @@ class Marks:
         self._update(pending, change, "attribute_exists(#due)", **values)
 
     def _update(self, pending: Pending, change: str, condition: str, **values: int) -> None:
-        """Change a mark if the condition holds."""
-        names = {"#due": DUE_MS, "#first": FIRST_DUE_MS}
-        more: dict[str, Any] = {}
-        if values:
-            numbers = {f":{name}": {"N": str(value)} for name, value in values.items()}
-            more["ExpressionAttributeValues"] = numbers
-        with suppress(self._client.exceptions.ConditionalCheckFailedException):
-            self._client.update_item(
-                TableName=self._table,
-                Key=pending.key,
-                UpdateExpression=change,
-                ConditionExpression=condition,
-                ExpressionAttributeNames={k: v for k, v in names.items() if k in change + condition},
-                **more,
-            )
-
-
-_CHUNK = 1024 * 1024
-
-
-class Version(NamedTuple):
-    """A version of an object, and when it was written."""
-
-    etag: str
-    written_ms: int
-
-
-class Read(NamedTuple):
-    """An object as a temporary file, its version, and its SHA-256."""
-
-    file: IO[bytes]
-    etag: str
-    sha256: str
-
-
-class Objects:
-    """The objects of a bucket."""
-
-    def __init__(self, client: S3Client, bucket: str) -> None:
-        self._client, self._bucket = client, bucket
-
-    def version(self, key: str) -> Version | None:
-        """The version that an object has now; None without an object."""
-        try:
-            head = self._client.head_object(Bucket=self._bucket, Key=key)
-            return Version(head["ETag"], round(head["LastModified"].timestamp() * 1000))
-        except ClientError as error:
-            if error.response["Error"]["Code"] in {"404", "NoSuchKey", "NotFound"}:
-                return None
-            raise
-
-    def read(self, key: str) -> Read:
-        """Read an object."""
-        answer = self._client.get_object(Bucket=self._bucket, Key=key)
-        file, digest = TemporaryFile(), hashlib.sha256()  # noqa: SIM115 - the caller's
-        for chunk in answer["Body"].iter_chunks(_CHUNK):
-            file.write(chunk)
-            digest.update(chunk)
-        file.seek(0)
-        return Read(file, answer["ETag"], digest.hexdigest())
-
-    def write(self, key: str, file: IO[bytes], version: Version | None) -> tuple[str, int]:
-        """Write a file's content if the object still has this version; returns its SHA-256 and its size.
-
-        Raises `ClientError` if another version is there.
-        """
-        condition: dict[str, Any] = {"IfNoneMatch": "*"} if version is None else {"IfMatch": version.etag}
-        digest = hashlib.sha256()
-        file.seek(0)
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
-        size = file.tell()
-        file.seek(0)
-        self._client.put_object(
-            Bucket=self._bucket, Key=key, Body=file, ChecksumAlgorithm="SHA256", **condition
-        )
-        return digest.hexdigest(), size
-
-    def remove(self, key: str, etag: str) -> None:
-        """Remove an object, unless it has been written again."""
-        try:
-            self._client.delete_object(Bucket=self._bucket, Key=key, IfMatch=etag)
-        except ClientError as error:
-            if error.response["Error"]["Code"] not in {"PreconditionFailed", "NoSuchKey"}:
-                raise
+        ArchiveTable(self._client, self._table).change(pending, change, condition, **values)
 
 
 @dataclass(frozen=True)
@@ -234,9 +137,7 @@ class Archive:
 
     def row(self, topic: str, hour: Hour) -> ArchivedHour | None:
         """An hour's row of the manifest."""
-        key = {TOPIC: {"S": topic}, HOUR: {"S": str(hour)}}
-        answer = self.client.get_item(TableName=self.manifest.name, Key=key, ConsistentRead=True)
-        return archived_hour(answer["Item"]) if "Item" in answer else None
+        return self.manifest.row(topic, hour)
 
 
 @cache

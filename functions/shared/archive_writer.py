@@ -72,7 +72,7 @@ def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHou
                     first_expires_s=written.first_expires_s,
                 ),
             )
-            _keep(archive, row, before)
+            archive.manifest.keep(row, before)
             emit(
                 "archive",
                 HoursArchived=1,
@@ -83,7 +83,7 @@ def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHou
         elif row is not None and written.first_expires_s != row.first_expires_s:
             # A batch that was sent twice expires by its last receipt, and the retention may be shorter now.
             before, row = row, replace(row, first_expires_s=written.first_expires_s)
-            _keep(archive, row, before)
+            archive.manifest.keep(row, before)
     archive.marks.done(pending, due_ms, now_ms)
     return row
 
@@ -133,17 +133,6 @@ def _with_archived(
         lines = files.enter_context(archive.objects.read(refused_key(parse_topic(row.topic), hour)).file)
         sources.append(iter(sorted(map(json.loads, lines), key=key_of)))
     return merged(*sources)
-
-
-def _keep(archive: Archive, row: ArchivedHour, before: ArchivedHour | None) -> None:
-    """Write the row, if the hour still has the content from before; raises `ClientError` if it has not."""
-    unchanged: dict[str, Any] = {"ConditionExpression": "attribute_not_exists(content)"}
-    if before is not None:
-        unchanged = {
-            "ConditionExpression": "content = :content",
-            "ExpressionAttributeValues": {":content": {"S": before.content}},
-        }
-    archive.client.put_item(TableName=archive.manifest.name, Item=row.item(), **unchanged)
 
 
 # Joins the hours of a day that is over to one object.

@@ -28,6 +28,7 @@ from iort_contract.checks import shown
 from iort_contract.dynamodb import Keys, TelemetryTable, plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, batch_id, run_ends
+from iort_contract.objects import code_of
 from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, SAMPLES
 from iort_contract.topics import parse_topic
 
@@ -105,7 +106,7 @@ class Archive:
             try:
                 return use(HourFile(self._stores, row))
             except Exception as error:  # noqa: PERF203 - it is tried twice, whatever S3's client is
-                if not isinstance(error, DAMAGED) and _code(error) not in _GONE:
+                if not isinstance(error, DAMAGED) and code_of(error) not in _GONE:
                     raise
                 problem = error
                 hour = parse_hour(row.hour)
@@ -114,12 +115,6 @@ class Archive:
         raise ArchiveError(
             f"the archive's {row.key or row.hour} of {self._topic} {what}: run `iort archive verify`"
         ) from problem
-
-
-def _code(error: Exception) -> str:
-    """The code of an error of boto3's; "" for any other."""
-    answer = getattr(error, "response", None)
-    return str(answer.get("Error", {}).get("Code", "")) if isinstance(answer, dict) else ""
 
 
 def is_expiring(row: ArchivedHour) -> bool:

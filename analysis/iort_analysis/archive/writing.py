@@ -63,6 +63,22 @@ class Piece(NamedTuple):
     batches: int
 
 
+class Head(NamedTuple):
+    """What a batch says beside its samples. ``fields`` has the names of its columns as the file has them:
+    `field_list`. ROS messages have their type's id and its layout."""
+
+    id: str
+    n: int
+    received_ms: int | None
+    nonfinite: int | None
+    previous: str | None
+    hash: str
+    fields: str
+    about: str | None = None
+    type_id: str | None = None
+    layout: str | None = None
+
+
 class _Entry(NamedTuple):
     """A valid item: what its batch says beside the samples, and the names of its columns; and its ROS
     messages, if it has them as published, with the fields in them."""
@@ -159,31 +175,57 @@ def _exact(values: Sequence[Value]) -> Column:
 
 def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:
     entries = [one for part, _ in parts for one in part]
-    block = join([part for _, part in parts])
-    counts = np.array([one.envelope.n for one in entries])
     messages = [
         raw for one in entries for raw in (one.messages.raw if one.messages else [None] * one.envelope.n)
     ]
+    return piece([_head_of(one) for one in entries], join([part for _, part in parts]), messages)
+
+
+def _head_of(one: _Entry) -> Head:
+    viewed = None if one.messages is None else one.viewed
+    return Head(
+        str(one.envelope.id),
+        one.envelope.n,
+        _received_ms(one.item),
+        one.envelope.nonfinite if NONFINITE in one.item else None,
+        one.item[PREVIOUS]["S"] if PREVIOUS in one.item else None,
+        item_hash(one.item),
+        field_list(one.names, viewed),
+        one.about or None,
+        one.messages.type_id if one.messages else None,
+        one.messages.layout if one.messages else None,
+    )
+
+
+def field_list(names: Sequence[str], viewed: Sequence[str] | None) -> str:
+    """A batch's fields, as the file names them; ``viewed`` are those in its ROS messages."""
+    own = ",".join(names)
+    return own if viewed is None else f"{','.join(viewed)}|{own}"
+
+
+def piece(heads: Sequence[Head], block: Block, messages: Sequence[bytes | None]) -> Piece:
+    """Batches as a piece: their samples one after the other, and for each its ROS message as published."""
+    counts = np.array([one.n for one in heads])
     own = {
         names.TIME: pa.array(block.times_us, type=OWN[names.TIME]),
         names.MESSAGE: pa.array(messages, type=OWN[names.MESSAGE]),
         names.OTHER: pa.nulls(len(block.times_us), OWN[names.OTHER]),
     }
     of_batches: dict[str, list[Any]] = {
-        names.BATCH_ID: [str(one.envelope.id) for one in entries],
-        names.RECEIVED: [_received_ms(one.item) for one in entries],
-        names.NOT_FINITE: [one.envelope.nonfinite if NONFINITE in one.item else None for one in entries],
-        names.PREVIOUS_RUNS: [one.item[PREVIOUS]["S"] if PREVIOUS in one.item else None for one in entries],
-        names.HASH: [item_hash(one.item) for one in entries],
-        names.FIELDS: [_fields(one) for one in entries],
-        names.ABOUT: [one.about or None for one in entries],
-        names.TYPE: [one.messages.type_id if one.messages else None for one in entries],
-        names.LAYOUT: [one.messages.layout if one.messages else None for one in entries],
+        names.BATCH_ID: [one.id for one in heads],
+        names.RECEIVED: [one.received_ms for one in heads],
+        names.NOT_FINITE: [one.nonfinite for one in heads],
+        names.PREVIOUS_RUNS: [one.previous for one in heads],
+        names.HASH: [one.hash for one in heads],
+        names.FIELDS: [one.fields for one in heads],
+        names.ABOUT: [one.about for one in heads],
+        names.TYPE: [one.type_id for one in heads],
+        names.LAYOUT: [one.layout for one in heads],
     }
     own.update({name: repeated(values, counts, OWN[name]) for name, values in of_batches.items()})
     kinds = {name: kind_of(column) for name, column in block.columns.items()}
     own.update({named(name): to_arrow(column, kinds[name]) for name, column in block.columns.items()})
-    return Piece(pa.table(own), kinds, len(entries))
+    return Piece(pa.table(own), kinds, len(heads))
 
 
 def _received_ms(item: Item) -> int | None:
@@ -193,14 +235,9 @@ def _received_ms(item: Item) -> int | None:
     return None
 
 
-def _fields(one: _Entry) -> str:
-    own = ",".join(one.names)
-    return own if one.messages is None else f"{','.join(one.viewed)}|{own}"
-
-
 # Gives a field's unit and its meaning, each perhaps empty.
 Describe = Callable[[str], tuple[str, str]]
-_LEVEL = 6
+LEVEL = 6
 
 
 class Written(NamedTuple):
@@ -251,25 +288,85 @@ def write_hour(
         refused.write(json.dumps(item, separators=(",", ":"), default=_base64).encode() + b"\n")
 
     batches = samples = 0
-    kinds: dict[str, str] = {}
-    places: list[Mapping[str, str]] = []
-    for piece in pieces(each(), refuse):
-        batches += piece.batches
-        samples += len(piece.table)
-        kinds.update(
-            {name: joined_kind(kind, kinds.get(name, NOTHING)) for name, kind in piece.kinds.items()}
-        )
-        places.append(piece.kinds)
-        with pa.ipc.new_stream(scratch, piece.table.schema) as stream:
-            stream.write_table(piece.table)
-    if places:
-        scratch.seek(0)
-        # Each piece is one batch of Arrow's.
-        streams = (pa.ipc.open_stream(scratch).read_all().combine_chunks() for _ in places)
-        tables = ((stream.to_batches()[0], local) for stream, local in zip(streams, places, strict=True))
-        _write(into, kinds, tables, {str(hour): (0, len(places))}, describe)
+    spool = Spool(scratch)
+    for one in pieces(each(), refuse):
+        batches += one.batches
+        samples += len(one.table)
+        spool.add(one)
+    if batches:
+        write_pieces(spool.pieces(), into, hour, describe)
     ordered = content_hash(sorted(hashes))
     return Written(batches, samples, dict(reasons), ordered, min(expiries, default=0))
+
+
+class Spool:
+    """Pieces in a file, until all of them are there: a file of the archive has one schema."""
+
+    def __init__(self, scratch: IO[bytes]) -> None:
+        self._scratch = scratch
+        self._pieces: list[tuple[Mapping[str, str], int]] = []
+
+    def add(self, one: Piece) -> None:
+        """Write a piece."""
+        self._pieces.append((one.kinds, one.batches))
+        with pa.ipc.new_stream(self._scratch, one.table.schema) as stream:
+            stream.write_table(one.table)
+
+    def pieces(self) -> Pieces:
+        """The pieces, to be read once."""
+        return Pieces(self._read(), len(self._pieces), joined_kinds(kinds for kinds, _ in self._pieces))
+
+    def _read(self) -> Iterator[Piece]:
+        self._scratch.seek(0)
+        for kinds, batches in self._pieces:
+            # Each piece is one batch of Arrow's.
+            table = pa.ipc.open_stream(self._scratch).read_all().combine_chunks()
+            yield Piece(table.to_batches()[0], kinds, batches)
+
+
+def joined_kinds(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """The kinds that hold the values of all."""
+    kinds: dict[str, str] = {}
+    for some in several:
+        kinds.update({name: joined_kind(kind, kinds.get(name, NOTHING)) for name, kind in some.items()})
+    return kinds
+
+
+class Pieces(NamedTuple):
+    """So many pieces, and the kinds of the fields of all of them."""
+
+    pieces: Iterable[Piece]
+    number: int
+    kinds: Mapping[str, str]
+
+
+def write_pieces(
+    some: Pieces, into: IO[bytes], hour: Hour, describe: Describe, *, level: int = LEVEL
+) -> None:
+    """Write an hour's pieces, in the order of their batches, each as a row group."""
+    tables = ((one.table, one.kinds) for one in some.pieces)
+    _write(
+        into, _schema(some.kinds, {str(hour): (0, some.number)}, describe), some.kinds, tables, level=level
+    )
+
+
+def in_order(pieces: Sequence[Piece]) -> Piece:
+    """Pieces whose batches lie among each other as one, in the order of the batches' ids."""
+    kinds = joined_kinds(one.kinds for one in pieces)
+    tables = [pa.table(_cast_all(one, kinds)) for one in pieces]
+    whole = pa.concat_tables(tables, promote_options="permissive").combine_chunks()
+    ids = np.array(whole[names.BATCH_ID].to_pylist(), dtype=object)
+    whole = whole.take(pa.array(np.argsort(ids, kind="stable"))).combine_chunks().unify_dictionaries()
+    return Piece(whole.combine_chunks().to_batches()[0], kinds, sum(one.batches for one in pieces))
+
+
+def _cast_all(one: Piece, kinds: Mapping[str, str]) -> dict[str, Any]:
+    own = {name: one.table[name] for name in OWN}
+    for name, kind in kinds.items():
+        has = name in one.kinds
+        nothing = pa.nulls(len(one.table), TYPES[kind])
+        own[named(name)] = cast(one.table[named(name)], one.kinds[name], kind) if has else nothing
+    return own
 
 
 def _base64(content: bytes) -> str:
@@ -279,27 +376,27 @@ def _base64(content: bytes) -> str:
 
 def write_day(hours: Mapping[Hour, ArchiveFile], into: IO[bytes], *, describe: Describe) -> None:
     """Join files to one with the row groups of these hours, each from the file that is given for it."""
-    kinds: dict[str, str] = {}
     places: dict[str, tuple[int, int]] = {}
     found: list[tuple[ArchiveFile, int]] = []
     for hour, file in sorted(hours.items()):
         groups = file.groups(hour)
         places[str(hour)] = (len(found), len(groups))
         found += [(file, group) for group in groups]
-        kinds.update({name: joined_kind(kind, kinds.get(name, NOTHING)) for name, kind in file.kinds.items()})
-    _write(into, kinds, ((file.table(group), file.kinds) for file, group in found), places, describe)
+    kinds = joined_kinds(file.kinds for _, file in sorted(hours.items()))
+    tables = ((file.table(group), file.kinds) for file, group in found)
+    _write(into, _schema(kinds, places, describe), kinds, tables, level=LEVEL)
 
 
 def _write(
     into: IO[bytes],
+    schema: Any,
     kinds: Mapping[str, str],
     tables: Iterable[tuple[Any, Mapping[str, str]]],
-    places: Mapping[str, tuple[int, int]],
-    describe: Describe,
+    *,
+    level: int,
 ) -> None:
     """Write each table, whose fields have these kinds, as a row group."""
-    of_columns = dict(list(kinds.items())[: names.MAX_COLUMNS])
-    schema = _schema(of_columns, places, describe)
+    of_columns = _columns(kinds)
     varied = [column_name(name) for name, kind in of_columns.items() if kind == VARIED]
     # Of a number with many values the bytes of one place are similar; of regular times, the steps.
     encodings = {**dict.fromkeys(varied, "BYTE_STREAM_SPLIT"), names.TIME: "DELTA_BINARY_PACKED"}
@@ -307,7 +404,7 @@ def _write(
         into,
         schema,
         compression="zstd",
-        compression_level=_LEVEL,
+        compression_level=level,
         column_encoding=encodings,
         use_dictionary=[name for name in schema.names if name not in {*encodings, names.MESSAGE}],
     ) as writer:
@@ -325,9 +422,14 @@ def _write(
             writer.write_table(rows, row_group_size=max(1, len(rows)))
 
 
-def _schema(kinds: Mapping[str, str], places: Mapping[str, tuple[int, int]], describe: Describe) -> Any:
+def _columns(kinds: Mapping[str, str]) -> dict[str, str]:
+    """The fields that have a column."""
+    return dict(list(kinds.items())[: names.MAX_COLUMNS])
+
+
+def _schema(every: Mapping[str, str], places: Mapping[str, tuple[int, int]], describe: Describe) -> Any:
     """The times, the fields, then what belongs to batches and messages."""
-    fields = []
+    fields, kinds = [], _columns(every)
     for name, kind in kinds.items():
         unit, meaning = describe(name)
         metadata = {names.FIELD: name.encode(), names.UNIT: unit.encode(), names.MEANING: meaning.encode()}

@@ -6,7 +6,8 @@ import re
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate
-from typing import Any, Mapping, NamedTuple, Sequence
+from operator import itemgetter
+from typing import Any, Hashable, Iterator, Mapping, NamedTuple, Sequence, Tuple
 
 from iort_contract.checks import (
     BOOT,
@@ -36,12 +37,13 @@ from iort_contract.limits import (
     MAX_AHEAD_US,
     MAX_BATCH_VALUES,
     MAX_FIELDS,
+    MAX_MESSAGE_BYTES,
     MAX_SAMPLES,
     ContractError,
     Value,
 )
 from iort_contract.ros.columns import as_columns, from_columns, values_a_message, view
-from iort_contract.ros.message import Messages, pack, unpack
+from iort_contract.ros.message import Messages, RosMessage, pack, unpack
 from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, RECEIVED_MS, ROBOT, SAMPLES, TOPIC
 from iort_contract.topics import RECORD, Topic, parse_topic
 
@@ -369,6 +371,61 @@ def decode_item(item: Mapping[str, Any]) -> tuple[Topic, Batch]:
             f"time {batch.t_us} us is over a year after its receipt: the car's clock is wrong"
         )
     return topic, batch
+
+
+# A batch closes at this many values: telemetry takes about 2 bytes a value in a message, random doubles 12.
+MAX_VALUES = 20_000
+# Or at so many bytes of serialized messages, which compress to between a tenth and all of it, and a third
+# more as text.
+MAX_BYTES = 96 * 1024
+Sample = Tuple[int, Mapping[str, Value]]
+
+
+def batches_of(boot: str, samples: Sequence[Sample]) -> Iterator[Batch]:
+    """Samples of a second as batches, whose numbers are the caller's to give: one for each ROS type, or each
+    set of fields, since a missing field is not the same as a null one. Samples of one time stay in order."""
+    alike: dict[Hashable, list[Sample]] = {}
+    for sample in sorted(samples, key=itemgetter(0)):
+        values = sample[1]
+        names = values.beside if isinstance(values, RosMessage) else values
+        kind = values.kind.id if isinstance(values, RosMessage) else None
+        alike.setdefault((kind, frozenset(names)), []).append(sample)
+    for group in alike.values():
+        yield _batch_of(boot, group)
+
+
+def _batch_of(boot: str, samples: Sequence[Sample]) -> Batch:
+    times = [t_us for t_us, _ in samples]
+    first = samples[0][1]
+    if isinstance(first, RosMessage):
+        messages = [values for _, values in samples if isinstance(values, RosMessage)]
+        beside = {name: [message.beside[name] for message in messages] for name in first.beside}
+        raw = [message.raw for message in messages]
+        return Batch(boot, 0, times, beside, 0, Messages(first.kind.id, first.kind.layout, raw))
+    return Batch(boot, 0, times, {name: [values[name] for _, values in samples] for name in first})
+
+
+def encode_fitting(batch: Batch) -> tuple[list[tuple[Batch, bytes]], list[str]]:
+    """The messages of a batch: one, or those of its halves if it does not fit, down to single samples, with
+    numbers from the batch's own on; and why the samples that no message can hold do not fit."""
+    problem = ""
+    try:
+        payload = encode_batch(batch)
+        if len(payload) <= MAX_MESSAGE_BYTES:
+            return [(batch, payload)], []
+        problem = f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes"
+    except ContractError as error:
+        problem = str(error)
+    if len(batch.times_us) > 1:
+        # One bad value must not cost the others.
+        first, second = split_batch(batch)
+        fitting, problems = encode_fitting(first)
+        more, others = encode_fitting(replace(second, seq=batch.seq + len(fitting)))
+        return fitting + more, problems + others
+    if batch.previous:
+        # Other batches of the run name the runs before it.
+        return encode_fitting(replace(batch, previous=()))
+    return [], [problem]
 
 
 def split_batch(batch: Batch) -> tuple[Batch, Batch]:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import re
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Iterator, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import AbstractSet, Any, Iterator, Mapping, NamedTuple, Optional, Sequence, Tuple
 
-from iort_contract.catalog.streams import TYPES_STREAM
+from iort_contract.catalog.streams import CATALOG, TYPES_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.recordings import Message, RecordingError
 from iort_contract.recordings.files import INDEX, Reader, library, wrapped
@@ -21,12 +23,34 @@ from iort_contract.recordings.scan import Scan
 from iort_contract.ros.decode import Decoder, Large, stamp_ns
 from iort_contract.ros.definition import parse
 from iort_contract.ros.message import MessageType, RosMessage, RosType
+from iort_contract.topics import stream_of
 
 _log = logging.getLogger(__name__)
 
 VESC_TYPE = "vesc_msgs/msg/VescStateStamped"
 # A header stamp this far from the time of recording comes from a clock that is not set, or a simulation.
 BELIEVABLE_NS = 3600 * 1_000_000_000
+
+
+# What ROS and its tools tell of themselves.
+_OWN = re.compile(
+    r"/(rosout|rosout_agg|parameter_events|clock|client_count|connected_clients|diagnostics_agg)"
+    r"|.*/(parameter_descriptions|parameter_updates|bond|transition_event)"
+)
+
+
+def is_ros_own(topic: str) -> bool:
+    """Whether ROS and its tools tell of themselves on a topic, or its name is hidden."""
+    return _OWN.fullmatch(topic) is not None or "/_" in topic
+
+
+def stream_for(topic: str, kind: str, taken: AbstractSet[str]) -> str:
+    """A name for the stream of a topic that is free."""
+    if _named(kind) == VESC_TYPE and VESC_STREAM not in taken:
+        return VESC_STREAM
+    name = stream_of(topic)
+    # Streams with known fields have these names.
+    return f"topic-{name}" if name in CATALOG else name
 
 
 class Kind(NamedTuple):

@@ -16,7 +16,7 @@ import re
 import struct
 from functools import lru_cache
 from itertools import islice
-from typing import Dict, Sequence
+from typing import Any, Callable, Dict, Sequence
 
 from iort_contract.limits import MAX_FIELDS, MessageError, Value
 from iort_contract.ros.definition import (
@@ -134,6 +134,9 @@ class Decoder:
         if len(self._body) == 1 and isinstance(self._body[0], Run) and self._body[0].numbers <= MAX_FIELDS:
             self.flat = self._body[0] if self._body[0].named("")[1] else None
 
+    # What reads the numbers that stand alone, and those of arrays.
+    _unpack: Callable[..., Sequence[Any]] = staticmethod(struct.unpack_from)
+
     def decode(self, data: bytes) -> dict[str, Value]:
         """The message as a sample; raises `MessageError` if the bytes do not fit the definition."""
         at = 0
@@ -228,7 +231,7 @@ class Decoder:
         if self.ros2:
             at += padding(at, SIZES[kind])
         assert path is not None
-        (out[path],) = struct.unpack_from(f"{self._order}{LETTERS[kind]}", data, at)
+        (out[path],) = self._unpack(f"{self._order}{LETTERS[kind]}", data, at)
         return at
 
     def _array(self, field: Field, path: str | None, data: bytes, at: int, out: _Sample) -> int:
@@ -262,7 +265,7 @@ class Decoder:
         # Empty arrays are no fields, so nothing limits their number: they must not cost names.
         if n and kind in LETTERS and isinstance(shown, range):
             letters = f"{self._order}{n}{LETTERS[kind]}"
-            out.update(zip(_element_names(path or ""), struct.unpack_from(letters, data, at)))
+            out.update(zip(_element_names(path or ""), self._unpack(letters, data, at)))
         elif extent is not None:
             for i in shown if extent.numbers else ():
                 if len(out) <= self._limit:

@@ -139,6 +139,15 @@ class Run:
             named[prefix] = struct.Struct("".join(letters)), names
         return named[prefix]
 
+    def places(self, prefix: str, phase: int = 0) -> Iterator[tuple[str, int, str]]:
+        """The wanted numbers: their paths, their places in the run, and their letters of `struct`."""
+        reader, names = self.named(prefix, phase)
+        paths, at = iter(names), 0
+        for count, letter in re.findall(r"(\d*)([a-zA-Z?])", reader.format):
+            if letter != "x":
+                yield next(paths), at, letter
+            at += struct.calcsize(f"<{count}{letter}")
+
     def gaps(self, phase: int) -> list[int]:
         """The places of the bytes that are no number's."""
         if phase in self._gaps:

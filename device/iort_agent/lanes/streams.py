@@ -6,31 +6,23 @@ import logging
 import math
 import threading
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
-from typing import Hashable, Iterable, Mapping, Sequence, Tuple
+from typing import Iterable, Mapping, Sequence
 
 from iort_agent.common.threads import Clock
 from iort_agent.lanes import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.spool import Spool
 from iort_contract.catalog.streams import TYPES_STREAM
-from iort_contract.limits import MAX_MESSAGE_BYTES, MAX_SAMPLES, ContractError, Value
-from iort_contract.messages.batch import Batch, encode_batch, split_batch
-from iort_contract.ros.message import Messages, RosMessage
+from iort_contract.limits import MAX_SAMPLES, Value
+from iort_contract.messages.batch import MAX_BYTES, MAX_VALUES, Sample, batches_of, encode_fitting
+from iort_contract.ros.message import RosMessage
 from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)
 
-# Real telemetry takes about 2 bytes a value in a message, random doubles 12; a batch that is too large all
-# the same is split when it is encoded.
-MAX_VALUES = 20_000
-# Of serialized messages, which compress to between a tenth and all of it, and a third more as text.
-MAX_BYTES = 96 * 1024
 # The sample that closes a batch by itself may come a little after batch_s.
 _GRACE_S = 0.1
 _MOST_OPEN = 8
-
-Sample = Tuple[int, Mapping[str, Value]]
 
 
 @dataclass
@@ -126,65 +118,24 @@ class BatchEncoder:
             self._close(slot)
 
     def _close(self, slot: tuple[int, int]) -> None:
-        """Put the samples into the spool, in as many messages as they need: one for each ROS type, or each
-        set of fields, since a missing field is not the same as a null one."""
-        samples = self._open.pop(slot).samples
-        samples.sort(key=itemgetter(0))
-        alike: dict[Hashable, list[Sample]] = {}
-        for sample in samples:
-            values = sample[1]
-            names = values.beside if isinstance(values, RosMessage) else values
-            kind = values.kind.id if isinstance(values, RosMessage) else None
-            alike.setdefault((kind, frozenset(names)), []).append(sample)
-        for group in alike.values():
-            self._put(_batch(self._boot, group))
-
-    def _put(self, batch: Batch) -> None:
-        """Encode a batch, or its halves if it does not fit, down to the sample to refuse."""
-        batch = replace(batch, seq=self._counts.batches, previous=self._spool.previous(self._stream))
-        problem = self._try(batch)
-        if problem and len(batch.times_us) > 1:
-            # One bad value must not cost the others.
-            for half in split_batch(batch):
-                self._put(half)
-            return
-        if problem and batch.previous:
-            # Other batches of the run name the runs before it.
-            problem = self._try(replace(batch, previous=()))
-        if problem:
-            self._refuse(problem)
-
-    def _try(self, batch: Batch) -> str:
-        """Put the batch into the spool; returns the problem of one that cannot be sent."""
-        try:
-            payload = encode_batch(batch)
-        except ContractError as error:
-            return str(error)
-        if len(payload) > MAX_MESSAGE_BYTES:
-            return f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes"
-        n = len(batch.times_us)
-        self._spool.put(self._stream, batch.boot, batch.seq, payload, samples=n)
-        self._counts.batches += 1
-        self._counts.stored += n
-        self._counts.nulled += _nonfinite(batch.columns)
-        return ""
+        """Put the samples into the spool, in as many messages as they need."""
+        for batch in batches_of(self._boot, self._open.pop(slot).samples):
+            previous = self._spool.previous(self._stream)
+            fitting, problems = encode_fitting(replace(batch, seq=self._counts.batches, previous=previous))
+            for one, payload in fitting:
+                n = len(one.times_us)
+                self._spool.put(self._stream, one.boot, one.seq, payload, samples=n)
+                self._counts.batches += 1
+                self._counts.stored += n
+                self._counts.nulled += _nonfinite(one.columns)
+            for problem in problems:
+                self._refuse(problem)
 
     def _refuse(self, why: str) -> None:
         self._counts.refused += 1
         # A stream that is wrong is wrong at its full rate; the first one says it all.
         level = logging.WARNING if self._counts.refused == 1 else logging.DEBUG
         _log.log(level, "stream %s: a sample cannot be sent: %s", self._stream, why)
-
-
-def _batch(boot: str, samples: Sequence[Sample]) -> Batch:
-    times = [t_us for t_us, _ in samples]
-    first = samples[0][1]
-    if isinstance(first, RosMessage):
-        messages = [values for _, values in samples if isinstance(values, RosMessage)]
-        beside = {name: [message.beside[name] for message in messages] for name in first.beside}
-        raw = [message.raw for message in messages]
-        return Batch(boot, 0, times, beside, 0, Messages(first.kind.id, first.kind.layout, raw))
-    return Batch(boot, 0, times, {name: [values[name] for _, values in samples] for name in first})
 
 
 def _nonfinite(columns: Mapping[str, Sequence[Value]]) -> int:

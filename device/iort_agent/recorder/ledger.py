@@ -9,8 +9,8 @@ from typing import Any, Iterable, Sequence, Tuple
 
 from iort_agent.recorder.folder import Drop
 from iort_agent.recorder.segment import RingChannel
-from iort_agent.sources.ros import matches
 from iort_contract.ros.message import RosType
+from iort_contract.topics import matches
 
 # Why a message is not in the ring: the bounded memory was full, the disk was full or failed, or the ring's
 # thread was at fault.

@@ -4,7 +4,6 @@ samples."""
 from __future__ import annotations
 
 import functools
-import hashlib
 import logging
 import re
 import threading
@@ -21,7 +20,7 @@ from iort_agent.sources.intake import Intake
 from iort_agent.sources.repeats import Repeats
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.limits import ContractError
-from iort_contract.topics import check_stream
+from iort_contract.topics import MAX_STREAM, check_stream, matches, stream_of
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +30,6 @@ _TOPIC = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
 _PATTERN = re.compile(r"/[\w/]*\*[\w/*]*", re.ASCII)
 _DIGIT_FIRST = re.compile(r"/\d", re.ASCII)
 _NODE = re.compile(r"[A-Za-z]\w*", re.ASCII)
-_MAX_STREAM = 64
 _MAX_TOPICS = 1000
 
 
@@ -85,26 +83,6 @@ def topics_rule(
         )
 
     return rule
-
-
-def stream_of(topic: str) -> str:
-    """The stream of a topic that names none. No two topics have the same: `-` is in no topic's name."""
-    name = topic.strip("/").replace("/", "-")
-    if len(name) > _MAX_STREAM:
-        digest = hashlib.sha256(topic.encode()).hexdigest()[:8]
-        name = f"{name[: _MAX_STREAM - 9]}-{digest}"
-    return name
-
-
-def matches(pattern: str, topic: str) -> bool:
-    """Whether a topic fits a pattern. Hidden topics, whose names have a part that begins with `_`, fit
-    none."""
-    return "/_" not in topic and _compiled(pattern).fullmatch(topic) is not None
-
-
-@functools.lru_cache(maxsize=256)
-def _compiled(pattern: str) -> re.Pattern[str]:
-    return re.compile(".*".join(map(re.escape, pattern.split("*"))))
 
 
 class RosConfig(SourceConfig):
@@ -238,7 +216,7 @@ class RosSource:
                 continue
             stream = settings.stream or stream_of(topic)
             if not settings.stream and stream in self._taken:
-                stream = f"topic-{stream}"[:_MAX_STREAM]
+                stream = f"topic-{stream}"[:MAX_STREAM]
             _log.info(
                 "topic %s: %s as the stream %s", topic, "in the ring" if settings.only else "recorded", stream
             )

@@ -21,7 +21,7 @@ from iort_agent.errors import ConfigError, SourceError
 from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_agent.sources import OK, UPLOAD
 from iort_agent.sources.intake import ARRIVAL, HEADER
-from iort_agent.sources.ros import matches, ros_name, stream_of
+from iort_agent.sources.ros import ros_name
 from iort_agent.sources.ros2 import Ros2Config
 from iort_agent.verbs.survey import (
     LARGE,
@@ -36,19 +36,14 @@ from iort_agent.verbs.survey import (
     listen,
     ports,
 )
-from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
+from iort_contract.recordings.rosbag import is_ros_own, stream_for
+from iort_contract.topics import matches
 
-# What ROS and its tools tell of themselves.
-_OWN = re.compile(
-    r"/(rosout|rosout_agg|parameter_events|clock|client_count|connected_clients|diagnostics_agg)"
-    r"|.*/(parameter_descriptions|parameter_updates|bond|transition_event)"
-)
 _DEBUG = re.compile(r".*debug.*", re.IGNORECASE)
 # Types whose messages are large, also when none came.
 _PICTURES = re.compile(r"sensor_msgs/(msg/)?((Compressed)?Image|PointCloud2)|.*/(msg/)?CompressedImage")
-_VESC = re.compile(r"vesc_msgs/(msg/)?VescStateStamped")
 _TYPE = re.compile(r"(\btype:\s*[\"']?[A-Za-z]\w*)/(msg/)?([A-Za-z]\w*)", re.ASCII)
 # A key at the beginning of a line, and what is indented below it or is an item of its list.
 _SOURCES = re.compile(r"^sources[ \t]*:.*\n(?:(?:(?:#.*)?\n)*[ \t-].*\n)*", re.MULTILINE)
@@ -103,7 +98,7 @@ def plan(ros: Ros | None, *, every: bool, wanted: Sequence[str], taken: set[str]
         elif every:
             left_out = ""
         left_out = left_out or _cannot(topic, ros)
-        stream = _stream(topic.name, kind, taken)
+        stream = stream_for(topic.name, kind, taken)
         if not left_out:
             taken.add(stream)
         lines.append(Line(topic, stream, large, left_out))
@@ -127,7 +122,7 @@ def _cannot(topic: Topic, ros: Ros | None) -> str:
 
 
 def _why_not(topic: Topic, *, large: bool) -> str:
-    if _OWN.fullmatch(topic.name) or "/_" in topic.name:
+    if is_ros_own(topic.name):
         return "ROS' own"
     if _DEBUG.fullmatch(topic.name):
         return "for debugging"
@@ -138,15 +133,6 @@ def _why_not(topic: Topic, *, large: bool) -> str:
     if (topic.rate_hz or 0) * topic.size > BYTES_PER_S:
         return f"more than the {BYTES_PER_S // 1024} KB a second of a connection"
     return ""
-
-
-def _stream(topic: str, kind: str, taken: set[str]) -> str:
-    """A name for the topic's stream that is free."""
-    if _VESC.fullmatch(kind) and VESC_STREAM not in taken:
-        return VESC_STREAM
-    name = stream_of(topic)
-    # Streams with known fields have these names.
-    return f"topic-{name}" if name in CATALOG else name
 
 
 def table(lines: Sequence[Line]) -> Iterator[str]:
@@ -231,7 +217,7 @@ def init(out: Path, *, every: bool, wanted: Sequence[str], listen_s: float, seam
         finally:
             node.close()
     # A machine may have both ROS: the one with more topics is the robot's.
-    graph = max(found, key=lambda ros: sum(not _OWN.fullmatch(one.name) for one in ros.topics), default=None)
+    graph = max(found, key=lambda ros: sum(not is_ros_own(one.name) for one in ros.topics), default=None)
     vescs = [poll.end(min(_POLL_S, listen_s)) for poll in polls]
     taken: set[str] = set()
     lines = plan(graph, every=every, wanted=wanted, taken=taken)

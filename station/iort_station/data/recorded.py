@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from iort_analysis.archive.hours import Archive, Stores
 from iort_analysis.archive.stored import AUTO, Origin, Source, Stored
@@ -19,7 +20,7 @@ from iort_contract.expression import ExpressionError, Node
 from iort_contract.limits import ContractError
 from iort_contract.topics import RECORD, build_topic, check_robot, check_stream
 from iort_station.cloud import Cloud
-from iort_station.errors import UsageError
+from iort_station.errors import StationError, UsageError
 from iort_station.times import Time, time_us
 
 
@@ -132,3 +133,22 @@ def stores(cloud: Cloud) -> Stores:
     return Stores(
         telemetry_table(cloud), manifest, lambda: (cloud.client("s3"), cloud.output("storage", "FilesBucket"))
     )
+
+
+# A write unit writes a kilobyte. AWS accepts 1,000 a second for a partition, which holds a whole topic. Half
+# of them are left to the robot.
+UNITS_PER_S = 500
+_UNIT_BYTES = 1024
+
+
+def write(table: dynamodb.TelemetryTable, items: Sequence[Mapping[str, Any]], units_per_s: int) -> None:
+    """Write items at so many write units a second; raises `StationError` if DynamoDB rejects them."""
+    for start in range(0, len(items), dynamodb.WRITE_ITEMS):
+        part, began = items[start : start + dynamodb.WRITE_ITEMS], time.monotonic()
+        try:
+            table.put(part)
+        except dynamodb.TableError as error:
+            raise StationError(f"{error}; do it again, or with fewer --units") from error
+        # About the units of an item, which is nearly all samples.
+        units = sum(-(-len(str(item)) // _UNIT_BYTES) for item in part)
+        time.sleep(max(0.0, began + units / units_per_s - time.monotonic()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,18 +14,14 @@ from iort_analysis.archive.hours import HourFile, is_expiring, key_of
 from iort_analysis.archive.stored import HEADER, ahead
 from iort_analysis.samples.batches import Item
 from iort_contract import archive
-from iort_contract.dynamodb import WRITE_ITEMS, Keys, TableError, TelemetryTable, starting_between, whole
+from iort_contract.dynamodb import Keys, starting_between, whole
 from iort_contract.tables import BATCH, ENVELOPE, EXPIRES_S
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
-from iort_station.data.recorded import Recorded, archive_of, telemetry_table
+from iort_station.data.recorded import UNITS_PER_S, Recorded, archive_of, telemetry_table, write
 from iort_station.errors import StationError
 from iort_station.operations.audit import Audit, audit
 
-# A write unit writes a kilobyte. AWS accepts 1,000 a second for a partition, which holds a whole topic. Half
-# of them are left to the robot.
-UNITS_PER_S = 500
-_UNIT_BYTES = 1024
 # The target's archive finds a batch within a day, by a sweep.
 _MERGED_S = 30 * 86_400
 # Receives the number of batches read.
@@ -92,19 +88,6 @@ def _lacking(target: Cloud, topic: str, items: Sequence[Item]) -> Iterator[Item]
         expires_s = whole(item, EXPIRES_S)
         if key_of(item) not in there and (expires_s is None or expires_s > now_s):
             yield item
-
-
-def write(table: TelemetryTable, items: Sequence[Mapping[str, Any]], units_per_s: int) -> None:
-    """Write items at so many write units a second; raises `StationError` if DynamoDB rejects them."""
-    for start in range(0, len(items), WRITE_ITEMS):
-        part, began = items[start : start + WRITE_ITEMS], time.monotonic()
-        try:
-            table.put(part)
-        except TableError as error:
-            raise StationError(f"{error}; do it again, or with fewer --units") from error
-        # About the units of an item, which is nearly all samples.
-        units = sum(-(-len(str(item)) // _UNIT_BYTES) for item in part)
-        time.sleep(max(0.0, began + units / units_per_s - time.monotonic()))
 
 
 def copy_hours(source: Cloud, target: Cloud, topic: str) -> int:

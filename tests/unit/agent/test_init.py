@@ -14,12 +14,12 @@ from iort_agent.common.threads import Clock, SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.ros import OnBytes
-from iort_agent.sources.ros import stream_of
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.verbs.init import Seams, init
 from iort_agent.verbs.survey import Polls, ports
 from iort_contract.messages.commands import DOWNLINK_NOTE, stick_downlink
 from iort_contract.ros.definition import Definition, parse
+from iort_contract.topics import stream_of
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import HEADER
 from tests.vesc_standin import VescStandin

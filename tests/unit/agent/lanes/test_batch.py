@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.lanes.streams import MAX_VALUES, BatchEncoder, StreamCounts, _Open
+from iort_agent.lanes.streams import BatchEncoder, StreamCounts, _Open
 from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES
-from iort_contract.messages.batch import Batch, RunEnd, decode_batch, messages_of
+from iort_contract.messages.batch import MAX_VALUES, Batch, RunEnd, decode_batch, messages_of
 from iort_contract.ros.message import RosMessage, RosType
 from testkit.agent import ManualClock, MemorySpool
 from tests.examples import examples

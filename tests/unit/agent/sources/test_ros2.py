@@ -21,11 +21,11 @@ from iort_agent.ros.qos import QosConfig
 from iort_agent.ros.ros2_node import Node
 from iort_agent.sources.registry import SOURCES
 from iort_agent.sources.repeats import Repeats
-from iort_agent.sources.ros import matches, stream_of
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.sources.ros2 import Ros2Config, Ros2Source
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.ros.message import RosMessage, message_type
+from iort_contract.topics import matches, stream_of
 from testkit.agent import ManualClock
 from testkit.waiting import until
 from tests.unit.agent.ros2_graph import LATCHED, RELIABLE, FakeGraph, FakeTypes

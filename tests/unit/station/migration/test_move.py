@@ -22,6 +22,7 @@ from iort_contract.findings_table import FindingsTable
 from iort_contract.messages.analysis import AnalysedDrive, Finding
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
+from iort_station.data import recorded
 from iort_station.errors import StationError
 from iort_station.migration import plan, recordings, robots
 from tests.unit.analysis.test_archive import batch_at, item_of
@@ -217,7 +218,7 @@ def test_the_write_rate_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     slept: list[float] = []
     monkeypatch.setattr(time, "sleep", slept.append)
     table: Any = Full()
-    recordings.write(table, [{"samples": "x" * 100}] * 100, 5)
+    recorded.write(table, [{"samples": "x" * 100}] * 100, 5)
     # A small batch is one unit, and 25 are written at once.
     assert table.calls == [25] * 4
     assert sum(slept) == pytest.approx(100 / 5, abs=1)
@@ -226,4 +227,4 @@ def test_the_write_rate_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_items_that_stay_unprocessed_are_an_error_with_advice() -> None:
     table: Any = Full(TableError("1 items of telemetry not written"))
     with pytest.raises(StationError, match=r"1 items of telemetry not written; do it again"):
-        recordings.write(table, [{"samples": "x"}], 5)
+        recorded.write(table, [{"samples": "x"}], 5)
