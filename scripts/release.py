@@ -103,6 +103,10 @@ def _build(folder: str, out: Path) -> tuple[Path, Path]:
         left_out = shutil.ignore_patterns("build", "*.egg-info", "__pycache__", "web")
         shutil.copytree(ROOT / folder, source, ignore=left_out)
         shutil.copy(ROOT / "LICENSE", source)
+        if folder == "station":
+            # What `iort mcp` offers to read.
+            pages = shutil.ignore_patterns("examples", "images", "*.json", "*.svg", "*.ipynb")
+            shutil.copytree(ROOT / "docs", source / "iort_station" / "documents", ignore=pages)
         # The locked setuptools of .venv, as for the checkout itself.
         command = [BIN / "uv", "build", "--quiet", "--offline", "--no-build-isolation"]
         command += ["--python", sys.executable, "--out-dir", made]

@@ -10,7 +10,9 @@ _NEAREST = 3
 
 class StationError(Exception):
     """The station cannot do what was asked; the text says why and, where it can, what helps. Several
-    arguments are a line each."""
+    arguments are a line each. ``nearest`` are known names that an unknown one may have meant."""
+
+    nearest: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.args))
@@ -30,4 +32,6 @@ def unknown(problem: str, names: Iterable[str], known: Iterable[str], all_of: st
         found for name in names for found in difflib.get_close_matches(name, there, n=_NEAREST, cutoff=0)
     )
     hint = f"the nearest: {', '.join(near)}; " if near else ""
-    return StationError(f"{problem}; {hint}`{all_of}` lists all")
+    error = StationError(f"{problem}; {hint}`{all_of}` lists all")
+    error.nearest = tuple(near)
+    return error

@@ -72,7 +72,7 @@ def connect(
 
     Raises `StationError` if none runs and AWS' credentials are missing.
     """
-    with _one_root():
+    with one_root():
         return Lab(
             Cloud.find(
                 namespace=namespace,
@@ -212,7 +212,7 @@ class Message:
         kind = _type(self.topic, self.type, self.definition)
         if kind.decoder is None:
             raise StationError(f"{self.type} cannot be decoded: {kind.error}")
-        with _one_root():
+        with one_root():
             return kind.decoder.decode(self.raw)
 
 
@@ -224,13 +224,13 @@ class Lab:
 
     def robots(self) -> list[Robot]:
         """The registered robots, by name."""
-        with _one_root():
+        with one_root():
             rows = {str(row[tables.ROBOT]): row for row in registry.listed(self._cloud)}
         return [_robot(name, rows[name]) for name in sorted(rows)]
 
     def streams(self, robot: str) -> list[Stream]:
         """The streams of a robot, the agent's own ones last. It reads some batches of each run."""
-        with _one_root():
+        with one_root():
             found = recorded.overview(self._cloud, robot)
         return [
             Stream(robot=robot, name=one.stream, **one.extent, runs=one.runs, fields=one.fields)
@@ -243,7 +243,7 @@ class Lab:
         """The newest ``count`` runs of a robot's agent that recorded in a range, newest first. A run that
         began before the range is given whole. It reads some batches of each run, never all samples."""
         start_us, end_us = _range(start, end)
-        with _one_root():
+        with one_root():
             found = recorded.runs(self._cloud, robot, start_us=start_us, end_us=end_us, count=count)["runs"]
         return [
             Run(
@@ -277,7 +277,7 @@ class Lab:
 
         Raises `StationError` for more values than ``most``, and for a field that no sample has.
         """
-        with _one_root():
+        with one_root():
             return query(
                 self._cloud, robot, stream, start, end, fields=fields, where=where, every=every, most=most
             )
@@ -290,13 +290,13 @@ class Lab:
         What was uploaded beside a message, such as a camera's image, is in it again. Raises `StationError` at
         the end if stored items could not be read, or if the stream's samples are no ROS messages.
         """
-        with _one_root():
+        with one_root():
             selection = select(robot, stream, start, end)
         return self._messages(selection)
 
     def _messages(self, selection: Selection) -> Iterator[Message]:
         cloud, robot, stream = self._cloud, selection.robot, selection.stream
-        with _one_root():
+        with one_root():
             declared = ros_messages.types(cloud, robot)
             known = {name: kind for name, kind in declared.items() if kind.stream == stream}
             export = Export(cloud, selection, known, lambda key: files.content(cloud, key))
@@ -329,7 +329,7 @@ class Lab:
     ) -> list[Incident]:
         """The incidents whose window has a part in a range, the newest first; of all robots without one."""
         start_us, end_us = _range(start, end)
-        with _one_root():
+        with one_root():
             found = recorder.incidents(self._cloud, robot, start_us, end_us)
             self._check_robot(robot, found)
         return [Incident(robot=one.robot, changed_us=one.t_us, **vars(one.incident)) for one in found]
@@ -345,7 +345,7 @@ class Lab:
         """The newest ``count`` findings of the analysis about drives that begin in a range, the newest first;
         of all robots without one."""
         start_us, end_us = _range(start, end)
-        with _one_root():
+        with one_root():
             found = stored.findings(self._cloud, robot, start_us, end_us, most=count)
             self._check_robot(robot, found)
         return found
@@ -355,7 +355,7 @@ class Lab:
     ) -> list[Laps]:
         """The laps of the newest ``count`` runs in a range, the oldest run first. It reads their samples."""
         start_us, end_us = _range(start, end)
-        with _one_root():
+        with one_root():
             found = list(recorded.laps_of_runs(self._cloud, robot, start_us, end_us, count=count))
         return [
             Laps(
@@ -376,7 +376,7 @@ class Lab:
 
         It decodes the stored batches.
         """
-        with _one_root():
+        with one_root():
             selection = select(robot, stream, start, end)
             found = verdict(self._cloud, robot, stream, selection.start_us, selection.end_us)
             if not found.batches:
@@ -389,7 +389,7 @@ class Lab:
 
 
 @contextmanager
-def _one_root() -> Iterator[None]:
+def one_root() -> Iterator[None]:
     """Raise what AWS, the analysis or the contract raises as the library's error."""
     try:
         yield

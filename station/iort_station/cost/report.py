@@ -4,14 +4,14 @@ needs of AWS' default quotas, and a deployment's own month, whoever drives. Pure
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
 from iort_contract.catalog.metrics import METRICS, metrics_of
 from iort_contract.cloud import IOT, PUBNUB
 from iort_station.cost import model
 from iort_station.cost.model import WRITE, bill, dollars_per_month, pubnub_bill, thesis_bill, total, units
-from iort_station.cost.prices import MONTH_HOURS, PRICES
+from iort_station.cost.prices import AS_OF, MONTH_HOURS, PRICES, REGION
 from iort_station.cost.usage import Usage
 
 # The agent waits at least this long before it reconnects; a test compares it with the agent.
@@ -253,3 +253,27 @@ def times(value: float) -> str:
 def dollars(value: float) -> str:
     """Dollars with their cents, or with four digits below one."""
     return f"{value:.4f}" if value < 1 else f"{value:,.2f}"
+
+
+def facts(usage: Usage) -> dict[str, Any]:
+    """The whole estimate for JSON, in US dollars."""
+    bills = {"items": bill(usage), "thesis_items": thesis_bill(usage), "pubnub_items": pubnub_bill(usage)}
+    items = {
+        name: [{**item._asdict(), "dollars_per_robot_hour": item.dollars} for item in of]
+        for name, of in bills.items()
+    }
+    return {
+        "prices_as_of": AS_OF,
+        "region": REGION,
+        "usage": asdict(usage),
+        **items,
+        "dollars_per_robot_hour": total(bills["items"]),
+        "thesis_dollars_per_robot_hour": total(bills["thesis_items"]),
+        "deployment_dollars_per_month": deployment_dollars_per_month(usage),
+        "fleet_dollars_per_month": dollars_per_month(bills["items"], usage),
+        "pubnub_mau_dollars_per_month": model.pubnub_mau_dollars_per_month(usage),
+        "quotas": [
+            {"name": n.name, "needed": n.needed, "quota": n.quota, "robots_at_quota": n.robots_at_quota}
+            for n in needs(usage)
+        ],
+    }

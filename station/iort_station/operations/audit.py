@@ -212,7 +212,8 @@ def _run(found: Sequence[Header], last: int, late_ms: int) -> RunAudit:
     seqs = sorted(by_seq)
     times_us = [header.id.t_us for header in found]
     took_ms = [header.received_ms - header.id.t_us // 1000 for header in found]
-    excess_ms = [took - min(took_ms) for took in took_ms]
+    fastest_ms = min(took_ms)
+    excess_ms = [took - fastest_ms for took in took_ms]
     missing = [
         Missing(a + 1, b - 1, by_seq[a].id.t_us, by_seq[b].id.t_us) for a, b in pairwise(seqs) if b > a + 1
     ]

@@ -7,7 +7,7 @@ its edges, and against the accounts of the runs, which tell what followed a run'
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -62,6 +62,10 @@ class _Reason(NamedTuple):
     missing: int = 0
 
 
+class _TooManyError(Exception):
+    pass
+
+
 def verdict(
     cloud: Cloud,
     robot: str,
@@ -70,9 +74,11 @@ def verdict(
     end_us: int | None = None,
     *,
     refused: tuple[int, str] | None = None,
+    most: int | None = None,
 ) -> Verdict:
     """The audit's word about a range. ``refused`` is what a reader of its samples could not read: how many
-    items, and the first; None has every batch of the table decoded here."""
+    items, and the first; None has every batch of the table decoded here. At more than ``most`` batches
+    nothing is compared, and the word is "unknown"."""
     recorded = Recorded(cloud, robot, stream)
     # A batch that began before the range may reach into it.
     low_us = None if start_us is None else start_us - MAX_BATCH_SPAN_US
@@ -91,12 +97,19 @@ def verdict(
 
     def counted() -> Iterator[Mapping[str, Any]]:
         nonlocal batches
-        for item in items:
+        for number, item in enumerate(items):
+            if number == most:
+                raise _TooManyError
             with suppress(ContractError):
                 batches += low <= batch_id(item.get(BATCH)).t_us < high
             yield item
 
-    found = audit(stream, counted())
+    about: dict[str, Any] = {"robot": robot, "stream": stream, "start_us": start_us, "end_us": end_us}
+    try:
+        found = audit(stream, counted())
+    except _TooManyError:
+        why = (f"the range has more than {most:,} batches: `iort audit` reads any number",)
+        return Verdict(**about, word="unknown", why=why, batches=batches, missing=0)
     runs = found.runs
     told = reports(cloud, robot, first_us, None if last_us is None else last_us + _REPORT_US) if runs else {}
     reasons = [*_gaps(found, low, high), *_tails(runs, stream, told, low, high)]
@@ -115,10 +128,7 @@ def verdict(
     if reasons:
         word = "incomplete" if any(one.known for one in reasons) else "unknown"
     return Verdict(
-        robot=robot,
-        stream=stream,
-        start_us=start_us,
-        end_us=end_us,
+        **about,
         word=word,
         why=tuple(dict.fromkeys(one.text for one in reasons)),
         batches=batches,
@@ -126,11 +136,18 @@ def verdict(
     )
 
 
+def _untils(runs: Sequence[RunAudit]) -> Iterator[tuple[RunAudit, int]]:
+    """The runs in order of time, each with the time at which the next one begins."""
+    in_time = sorted(runs, key=lambda run: run.first_us)
+    starts = [run.first_us for run in in_time]
+    yield from zip(in_time, [*starts, _ENDLESS_US][1:], strict=True)
+
+
 def _gaps(found: Audit, low_us: int, high_us: int) -> Iterator[_Reason]:
     """The numbers that are missing for sure in the range."""
-    for run in found.runs:
+    for run, until_us in _untils(found.runs):
         for gap in run.missing:
-            after_us, before_us = gap.after_us or 0, gap.before_us or _ENDLESS_US
+            after_us, before_us = gap.after_us or 0, gap.before_us or until_us
             if after_us < high_us and before_us > low_us:
                 where = f"after {iso(after_us)}" if gap.after_us else f"before {iso(before_us)}"
                 text = f"batches {gap.first:,} to {gap.last:,} of run {run.boot[:8]} are not stored, {where}"
@@ -141,12 +158,10 @@ def _gaps(found: Audit, low_us: int, high_us: int) -> Iterator[_Reason]:
 
 
 def _tails(
-    runs: list[RunAudit], stream: str, told: Mapping[str, Account], low_us: int, high_us: int
+    runs: Sequence[RunAudit], stream: str, told: Mapping[str, Account], low_us: int, high_us: int
 ) -> Iterator[_Reason]:
     """What may have followed the last stored batch of each run that is in the range."""
-    in_time = sorted(runs, key=lambda run: run.first_us)
-    for i, run in enumerate(in_time):
-        until_us = in_time[i + 1].first_us if i + 1 < len(in_time) else _ENDLESS_US
+    for run, until_us in _untils(runs):
         account = told.get(run.boot)
         stated = None if account is None else account.streams.get(stream)
         name = f"run {run.boot[:8]}"

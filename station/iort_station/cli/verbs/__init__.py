@@ -34,6 +34,7 @@ VERBS = {
     "laps": ("laps", "List laps: time, distance, energy, and compare two."),
     "analyse": ("analysis", "Analyse robots' drives in the cloud, now."),
     "findings": ("analysis", "List what the analysis found about drives."),
+    "mcp": ("mcp", "Answer programs that ask, by the Model Context Protocol."),
     "note": ("analysis", "Write, list or delete notes about a robot."),
     "recorder": ("triggers", "What robots keep of what happened, and when."),
     "incidents": ("incidents", "List or download what robots have kept."),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -10,7 +10,7 @@ import typer
 
 from iort_station.cli.console import out, print_json, table
 from iort_station.cli.options import AsJson, examples, option, spread
-from iort_station.cost import model, report
+from iort_station.cost import report
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import TRANSPORTS, Usage, as_configured
 
@@ -64,7 +64,7 @@ def cost_(
         given.setdefault("watched_hours", given.get("hours_per_day", usage.hours_per_day))
     usage = replace(usage, **given).check()
     if as_json:
-        print_json(_as_json(usage))
+        print_json(report.facts(usage))
         return
     of_each = f" in each of {usage.streams} streams" if usage.streams > 1 else ""
     looks = f"while somebody looks, {usage.watched:.0%} of the time"
@@ -85,26 +85,3 @@ def cost_(
         for row in rows.body:
             shown.add_row(*row, style="bold" if row[0].startswith("total") else "")
         out.print(shown)
-
-
-def _as_json(usage: Usage) -> dict[str, Any]:
-    bills = {"items": model.bill(usage), "thesis_items": model.thesis_bill(usage)}
-    items = {
-        name: [{**item._asdict(), "dollars_per_robot_hour": item.dollars} for item in bill]
-        for name, bill in {**bills, "pubnub_items": model.pubnub_bill(usage)}.items()
-    }
-    return {
-        "prices_as_of": AS_OF,
-        "region": REGION,
-        "usage": asdict(usage),
-        **items,
-        "dollars_per_robot_hour": model.total(bills["items"]),
-        "thesis_dollars_per_robot_hour": model.total(bills["thesis_items"]),
-        "deployment_dollars_per_month": report.deployment_dollars_per_month(usage),
-        "fleet_dollars_per_month": model.dollars_per_month(bills["items"], usage),
-        "pubnub_mau_dollars_per_month": model.pubnub_mau_dollars_per_month(usage),
-        "quotas": [
-            {"name": n.name, "needed": n.needed, "quota": n.quota, "robots_at_quota": n.robots_at_quota}
-            for n in report.needs(usage)
-        ],
-    }
