@@ -160,7 +160,7 @@ def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(pag
     low, high = plain(page.locator("section[aria-label=Speed] .note").inner_text()).split(" to ")
     assert [float(low) * 10, float(high) * 10] == pytest.approx([15, 30], abs=0.3)
     chart(page, "Speed").click(position={"x": 40, "y": 40})
-    page.get_by_role("button", name="Battery voltage").click()
+    page.get_by_role("button", name="Battery voltage", exact=True).click()
     link = page.url
     other = open_page(link, timezone_id="UTC")
     cursor = page.locator(".scrub-at").inner_text()
@@ -177,7 +177,7 @@ def test_dragging_zooms_all_charts_into_finer_data_and_a_link_shows_the_same(pag
 
 
 def test_the_wheel_pans_a_zoomed_chart_and_scrolls_the_page_otherwise(page):
-    page.set_viewport_size({"width": 1280, "height": 500})
+    page.set_viewport_size({"width": 1280, "height": 640})
     drag(page, "Speed", 0.4, 0.6)
     until(lambda: shown(page)[1] - shown(page)[0] < 10, "the zoom")
     before = shown(page)

@@ -4,12 +4,12 @@ import type { FieldTable, TrackMap } from "../base/contract";
 import { el, panel } from "../base/dom";
 import { AS_SENT, type Linear, linear, spec } from "../base/format";
 import { ChartPanel } from "../charts/chart_panel";
+import { edges } from "../charts/track_map";
 import { WINDOWS, windowLabel } from "../charts/windows";
 import { type Track, XYChart } from "../charts/xy_chart";
 import type { Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
 import { BOARD, type LineSpec, type XYChartSpec } from "./car_charts";
-import { edges } from "./track_map";
 
 const MOST_POINTS = 4000;
 

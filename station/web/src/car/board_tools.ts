@@ -58,7 +58,7 @@ export class BoardTools {
 
   /** The board was changed by hand. */
   arranged(): void {
-    this.choose(this.window_s, this.board.charts.join(","));
+    this.choose(this.window_s, this.board.keys.join(","));
   }
 
   private choose(window_s: number, charts: string): void {
@@ -72,14 +72,14 @@ export class BoardTools {
     this.window_s = WINDOWS.find((each) => each === window_s) ?? WINDOWS[0];
     this.window.value = String(this.window_s);
     this.board.span(this.window_s);
-    if (charts !== this.board.charts.join(",")) this.board.set(charts.split(","));
-    this.charts = this.board.charts.join(",");
+    if (charts !== this.board.keys.join(",")) this.board.set(charts.split(","));
+    this.charts = this.board.keys.join(",");
     this.reset.hidden = Object.values(this.query).every((value) => value === undefined);
   }
 
   /** Offer the charts that are not shown, and the numbers of every stream. */
   private offer(): void {
-    const shown = new Set(this.board.charts);
+    const shown = new Set(this.board.keys);
     const group = (label: string, of: readonly (readonly [value: string, text: string])[]): HTMLElement[] => {
       const others = of.filter(([value]) => !shown.has(value));
       return others.length > 0 ? [el("optgroup", { label }, ...choices(others))] : [];

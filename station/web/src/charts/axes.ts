@@ -107,7 +107,7 @@ export function faint(rgb: string, share = 0.09): string {
   return rgb.startsWith("rgb(") ? rgb.replace("rgb(", "rgba(").replace(")", `, ${share})`) : rgb;
 }
 
-/** The gaps of a line: missing values, and times without samples. */
+/** The gaps of a line: missing values, and times without samples. What is undefined is a row of another line. */
 export function holes(hole_s: () => number) {
   return (
     plot: uPlot,
@@ -118,14 +118,18 @@ export function holes(hole_s: () => number) {
   ): uPlot.Series.Gaps => {
     const times = plot.data[0];
     const values = plot.data[series]!;
-    let shown = -1;
+    let [shown, missing] = [-1, false];
     for (let i = Math.max(0, first - 1); i <= last; i += 1) {
       const value = values[i];
-      if (value === null || value === undefined || Number.isNaN(value)) continue;
-      if (shown >= 0 && (shown < i - 1 || times[i]! - times[shown]! > hole_s())) {
+      if (value === undefined) continue;
+      if (value === null || Number.isNaN(value)) {
+        missing = true;
+        continue;
+      }
+      if (shown >= 0 && (missing || times[i]! - times[shown]! > hole_s())) {
         gaps.push([plot.valToPos(times[shown]!, "x", true), plot.valToPos(times[i]!, "x", true)]);
       }
-      shown = i;
+      [shown, missing] = [i, false];
     }
     return gaps;
   };

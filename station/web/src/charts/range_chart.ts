@@ -1,6 +1,7 @@
 // A chart of a range by uPlot: of a past time, with the time of day below it, or of any other quantity.
 
 import uPlot from "uplot";
+import { el, setAttribute } from "../base/dom";
 import { dayTime, number, when } from "../base/format";
 import type { Range } from "../base/range";
 import { colour, onTheme } from "../base/theme";
@@ -37,6 +38,15 @@ export interface Hands {
   readonly pick: () => void;
 }
 
+/** A value that the viewer drags up and down. */
+export interface Threshold {
+  readonly value: number;
+  /** The line that it is of, by its place. */
+  readonly line: number;
+  readonly write: (value: number) => string;
+  readonly moved: (value: number) => void;
+}
+
 export interface RangeChartOptions {
   readonly curves: readonly Curve[];
   /** Its title, and a value with its unit. */
@@ -57,8 +67,6 @@ export interface RangeChartOptions {
 // A shorter drag is a click.
 const LEAST_DRAG_PX = 5;
 const NO_SELECTION = { left: 0, top: 0, width: 0, height: 0 };
-/** The chart on which a drag began: uPlot draws the selection on all that share a cursor. */
-let dragged: RangeChart | undefined;
 
 export class RangeChart {
   private readonly plot: uPlot;
@@ -70,6 +78,16 @@ export class RangeChart {
   private range: Range;
   private hole_s: number;
   private marks: readonly Mark[] = [];
+  /** What has moved the cursor last. */
+  private pointed: MouseEvent | null = null;
+  private threshold: Threshold | undefined;
+  private readonly handle = el("div", {
+    class: "threshold",
+    role: "slider",
+    tabindex: "0",
+    "aria-orientation": "vertical",
+    "aria-label": "Threshold",
+  });
 
   constructor(host: HTMLElement, options: RangeChartOptions, data: uPlot.AlignedData, range: Range) {
     this.range = range;
@@ -81,15 +99,13 @@ export class RangeChart {
     };
     read();
     const colours = () => this.paint;
-    const rounded = (_: uPlot, low: number | null, high: number | null): [number, number] =>
-      low === null || high === null
-        ? [0, 1]
-        : roundRange(
-            low,
-            high,
-            Math.max(Math.abs(high) * 0.02, high === 0 && low === 0 ? 1 : 1e-6),
-            options.zero ?? false,
-          );
+    const rounded = (_: uPlot, low: number | null, high: number | null, scale: string): [number, number] => {
+      if (low === null || high === null) return [0, 1];
+      if (this.threshold && scale === this.limitScale)
+        [low, high] = [Math.min(low, this.threshold.value), Math.max(high, this.threshold.value)];
+      const span = Math.max(Math.abs(high) * 0.02, high === 0 && low === 0 ? 1 : 1e-6);
+      return roundRange(low, high, span, options.zero ?? false);
+    };
     const right = options.curves.some((curve) => curve.right);
     const series: uPlot.Series[] = options.curves.map((curve, i) => ({
       scale: curve.right ? "right" : "y",
@@ -142,9 +158,16 @@ export class RangeChart {
         series: [{}, ...series, ...(options.band ? [edge, edge] : [])],
         ...(options.band ? { bands: [{ series: [3, 2], fill: () => faint(this.palette[0]!, 0.22) }] } : {}),
         hooks: {
-          setCursor: [(plot) => options.onCursor?.(plot.cursor.idx ?? null)],
+          setCursor: [
+            ({ cursor }) => {
+              // A drawing, or the page, has moved the cursor of a chart with hands: only a pointer's word counts.
+              if (hands && cursor.event === this.pointed) return;
+              this.pointed = cursor.event ?? null;
+              options.onCursor?.(cursor.idx ?? null);
+            },
+          ],
           setSelect: [(plot) => this.selected(plot, hands)],
-          draw: [(plot) => this.drawMarks(plot)],
+          draw: [(plot) => this.drawMarks(plot), () => this.placeHandle()],
         },
       },
       data,
@@ -161,8 +184,10 @@ export class RangeChart {
       at: (x) => (unit === undefined ? dayTime(x, { fractionalSecondDigits: 1 }) : `${number(x, 2)} ${unit}`),
       timeless: unit !== undefined,
       band: options.band ?? false,
+      ...(hands ? { keyed: (index) => options.onCursor?.(index), rested: hands.pick } : {}),
     });
     if (hands) this.listen(host, hands);
+    this.holdHandle();
     fit(host, this.plot, () => {});
     this.themed = onTheme(() => {
       read();
@@ -191,6 +216,57 @@ export class RangeChart {
     this.plot.redraw(false);
   }
 
+  /** Show a threshold that the viewer drags, or moves with the keys; undefined removes it. */
+  set limit(threshold: Threshold | undefined) {
+    this.threshold = threshold;
+    if (!threshold) this.handle.remove();
+    else if (!this.handle.isConnected) this.plot.over.append(this.handle);
+    // The axis reaches to it; while it is dragged, the axis stays.
+    if (this.handle.matches(":active")) this.placeHandle();
+    else this.plot.setData(this.plot.data);
+  }
+
+  private get limitScale(): string {
+    return this.plot.series[(this.threshold?.line ?? 0) + 1]?.scale ?? "y";
+  }
+
+  private placeHandle(): void {
+    const { threshold, plot, handle } = this;
+    if (!threshold) return;
+    const { min = 0, max = 1 } = plot.scales[this.limitScale] ?? {};
+    const top = plot.valToPos(threshold.value, this.limitScale);
+    handle.style.translate = `0 ${Math.max(0, Math.min(plot.over.clientHeight, top)).toFixed(1)}px`;
+    setAttribute(handle, "aria-valuenow", String(threshold.value));
+    setAttribute(handle, "aria-valuemin", String(Math.min(min ?? 0, threshold.value)));
+    setAttribute(handle, "aria-valuemax", String(Math.max(max ?? 1, threshold.value)));
+    setAttribute(handle, "aria-valuetext", threshold.write(threshold.value));
+  }
+
+  private holdHandle(): void {
+    const { handle, plot } = this;
+    // What begins here is no zoom, no click and no pan of the chart.
+    for (const event of ["mousedown", "click", "dblclick", "touchstart"])
+      handle.addEventListener(event, (each) => each.stopPropagation());
+    handle.addEventListener("pointerdown", (event) => {
+      handle.setPointerCapture(event.pointerId);
+      event.stopPropagation();
+    });
+    handle.addEventListener("pointermove", (event) => {
+      if (!handle.hasPointerCapture(event.pointerId)) return;
+      const y = event.clientY - plot.over.getBoundingClientRect().top;
+      this.threshold?.moved(plot.posToVal(Math.max(0, Math.min(plot.over.clientHeight, y)), this.limitScale));
+    });
+    handle.addEventListener("keydown", (event) => {
+      const { min, max } = plot.scales[this.limitScale] ?? {};
+      const step = ((max ?? 1) - (min ?? 0)) / (event.shiftKey ? 10 : 100);
+      const by = { ArrowUp: step, ArrowDown: -step }[event.key];
+      if (by === undefined || !this.threshold) return;
+      this.threshold.moved(this.threshold.value + by);
+      event.preventDefault();
+      event.stopPropagation();
+    });
+  }
+
   /** Put the cursor on a row. */
   point(index: number): void {
     // After uPlot has drawn new data or another range, in a microtask of its own.
@@ -208,6 +284,7 @@ export class RangeChart {
   private listen(host: HTMLElement, hands: Hands): void {
     host.addEventListener("keydown", (event) => {
       if (event.key === "-") hands.back();
+      if (event.key === "Enter") hands.pick();
       if (event.key !== "+") return;
       const [from, to] = this.range;
       const at = this.plot.data[0][this.plot.cursor.idx ?? -1] ?? (from + to) / 2;
@@ -215,10 +292,7 @@ export class RangeChart {
     });
     const { over } = this.plot;
     let at = 0;
-    over.addEventListener("mousedown", (event) => {
-      dragged = this;
-      at = event.clientX;
-    });
+    over.addEventListener("mousedown", (event) => (at = event.clientX));
     over.addEventListener("click", (event) => Math.abs(event.clientX - at) < LEAST_DRAG_PX && hands.pick());
     over.addEventListener("dblclick", () => hands.back());
     gestures(over, { range: () => this.range, move: hands.move });
@@ -252,7 +326,6 @@ export class RangeChart {
     const { left, width } = plot.select;
     if (width <= 0) return;
     plot.setSelect(NO_SELECTION, false);
-    if (dragged !== this || width < LEAST_DRAG_PX) return;
-    hands?.zoom([plot.posToVal(left, "x"), plot.posToVal(left + width, "x")]);
+    if (width >= LEAST_DRAG_PX) hands?.zoom([plot.posToVal(left, "x"), plot.posToVal(left + width, "x")]);
   }
 }

@@ -11,7 +11,7 @@ export interface XYChartOptions {
   readonly title: string;
   /** A text, or a function that gives one when the chart is drawn. */
   readonly x: string | (() => string);
-  readonly y: string;
+  readonly y: string | (() => string);
   /** The minimum range of each axis. */
   readonly span: readonly [number, number];
   /** Both axes include zero. */
@@ -32,19 +32,21 @@ const FRAME_S = 0.1;
 const SHADES = 12;
 
 export class XYChart {
-  private readonly plot: uPlot;
+  protected readonly plot: uPlot;
   private readonly offTheme: () => void;
-  private track: Track = { x: [], y: [] };
+  protected track: Track = { x: [], y: [] };
   private grounded = false;
   private visible = true;
   private drawnAt = -Infinity;
-  private ink = "";
+  protected ink = "";
   private paint = paint();
   private writtenAt = -Infinity;
   private bounds: { x: [number, number]; y: [number, number] };
+  /** A line on the ground, such as the fastest one. */
+  protected line: Track | undefined;
 
   constructor(
-    private readonly host: HTMLElement,
+    protected readonly host: HTMLElement,
     private readonly options: XYChartOptions,
   ) {
     host.setAttribute("role", "img");
@@ -85,7 +87,7 @@ export class XYChart {
           }),
         ],
         series: [{}, { show: true, paths: () => null, points: { show: false } }],
-        hooks: { draw: [(plot) => this.drawTrack(plot)] },
+        hooks: { draw: [(plot) => this.drawAll(plot)] },
       },
       [[0], [0]],
       host,
@@ -93,12 +95,17 @@ export class XYChart {
     fit(host, this.plot, (visible) => {
       this.visible = visible;
       this.drawnAt = -Infinity;
+      this.changed();
     });
     this.offTheme = onTheme(() => {
       [this.ink, this.paint] = [colour("--accent"), paint()];
       this.drawnAt = -Infinity;
+      this.changed();
     });
   }
+
+  /** The chart has another size or theme. A live one is drawn again anyway. */
+  protected changed(): void {}
 
   destroy(): void {
     this.offTheme();
@@ -112,23 +119,29 @@ export class XYChart {
   draw(now: number, track: () => Track): void {
     if (!this.due(now)) return;
     this.drawnAt = now;
-    this.track = track();
+    this.show(track());
+    if (performance.now() - this.writtenAt >= AGAIN_MS) this.write();
+  }
+
+  /** Draw this track, and choose the axes for it. */
+  protected show(track: Track): void {
+    this.track = track;
     this.setBounds();
     this.plot.batch(() => {
       this.plot.setScale("x", { min: this.bounds.x[0], max: this.bounds.x[1] });
       this.plot.setScale("y", { min: this.bounds.y[0], max: this.bounds.y[1] });
       this.plot.redraw(false, true);
     });
-    if (performance.now() - this.writtenAt >= AGAIN_MS) this.write();
   }
 
   /** Say in words what the chart shows. */
-  private write(): void {
+  protected write(): void {
     this.writtenAt = performance.now();
     const { title, x, y } = this.options;
+    const named = (name: typeof x): string => (typeof name === "string" ? name : name());
     const axes = [
-      [typeof x === "string" ? x : x(), this.track.x],
-      [y, this.track.y],
+      [named(x), this.track.x],
+      [named(y), this.track.y],
     ] as const;
     const figures = axes.map(([name, values]) => {
       const { newest, least, most } = extremes(values);
@@ -175,22 +188,30 @@ export class XYChart {
   private drawGround(plot: uPlot, [left, right]: readonly [Track, Track]): void {
     const { ctx } = plot;
     ctx.beginPath();
-    for (const { x, y } of [left, right]) {
-      for (let i = 0; i < x.length; i += 1) {
-        const [px, py] = [plot.valToPos(x[i]!, "x", true), plot.valToPos(y[i]!, "y", true)];
-        if (i === 0) ctx.moveTo(px, py);
-        else ctx.lineTo(px, py);
-      }
-    }
+    for (const edge of [left, right]) this.trace(edge);
     ctx.fillStyle = this.paint.grid;
     ctx.fill("evenodd");
     ctx.strokeStyle = this.paint.text;
     ctx.lineWidth = uPlot.pxRatio;
     ctx.stroke();
+    if (!this.line) return;
+    ctx.beginPath();
+    this.trace(this.line);
+    ctx.setLineDash([6 * uPlot.pxRatio, 4 * uPlot.pxRatio]);
+    ctx.stroke();
+    ctx.setLineDash([]);
   }
 
-  private drawTrack(plot: uPlot): void {
-    const { x, y } = this.track;
+  private trace({ x, y }: Track): void {
+    const { plot } = this;
+    for (let i = 0; i < x.length; i += 1) {
+      const [px, py] = [plot.valToPos(x[i]!, "x", true), plot.valToPos(y[i]!, "y", true)];
+      if (i === 0) plot.ctx.moveTo(px, py);
+      else plot.ctx.lineTo(px, py);
+    }
+  }
+
+  private drawAll(plot: uPlot): void {
     const { ctx } = plot;
     const { left, top, width, height } = plot.bbox;
     ctx.save();
@@ -200,6 +221,14 @@ export class XYChart {
     if (this.grounded) this.drawGround(plot, this.options.ground!);
     ctx.lineWidth = 1.75 * uPlot.pxRatio;
     ctx.lineJoin = "round";
+    this.drawTrack(plot);
+    ctx.restore();
+  }
+
+  /** Draw the track alone, clipped to the plot. */
+  protected drawTrack(plot: uPlot): void {
+    const { x, y } = this.track;
+    const { ctx } = plot;
     // A few shades from old to new: a stroke for each point would be slow.
     for (let shade = 0; shade < SHADES; shade += 1) {
       const from = Math.floor((x.length * shade) / SHADES);
@@ -231,7 +260,6 @@ export class XYChart {
       ctx.fillStyle = this.ink;
       ctx.fill();
     }
-    ctx.restore();
   }
 }
 

@@ -2,11 +2,12 @@
 
 import { type LapsAnswer, NAME, type RunsAnswer } from "../base/contract";
 import { byName, choices, el, form, Text } from "../base/dom";
-import { age, number, when } from "../base/format";
+import { age, when } from "../base/format";
 import { inUs, rangeOf } from "../base/range";
 import type { Part } from "../base/route";
 import type { Fleet } from "../live/fleet";
 import { ask, Latest, words } from "../server/answers";
+import { lapLabel } from "./laps_list";
 
 const RUNS = 20;
 
@@ -101,9 +102,6 @@ export class AddPart {
 
   private offer(laps: LapsAnswer["laps"], robot = ""): void {
     this.laps = laps.map(({ from_us, to_us }) => ({ robot, range: [from_us / 1e6, to_us / 1e6] }));
-    const texts = laps.map(
-      ({ lap, time_s, best }) => `${lap}: ${number(time_s, 2)} s${best ? ", the best" : ""}`,
-    );
-    this.lap.replaceChildren(...choices(["the whole run", ...texts]));
+    this.lap.replaceChildren(...choices(["the whole run", ...laps.map(lapLabel)]));
   }
 }

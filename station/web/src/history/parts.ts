@@ -4,10 +4,10 @@ import type { FieldTable, HistoryAnswer } from "../base/contract";
 import { asSpeed, numbers, type Spec, spec } from "../base/format";
 import { inUs, type Range } from "../base/range";
 import type { Part } from "../base/route";
+import type { Columns } from "../charts/lines_panel";
 import type { Fleet } from "../live/fleet";
 import { ask } from "../server/answers";
 import { type Axis, distance, onGrid } from "./align";
-import type { Charted } from "./field_charts";
 
 // The rows of a request, and the steps of the grid: about the width of a chart in points.
 const ROWS = 1500;
@@ -22,6 +22,16 @@ interface Loaded {
   /** The seconds since the part's start, and the place on the axis. */
   readonly t: readonly number[];
   readonly x: readonly number[];
+}
+
+/** What is charted, in the units that are shown: for each field a column for each name, over x in the unit `along`. A
+ *  line has a gap after `hole` of x without a value. */
+export interface Charted {
+  readonly x: readonly number[];
+  readonly along: string;
+  readonly hole: number;
+  readonly fields: ReadonlyMap<string, Columns>;
+  readonly names: readonly string[];
 }
 
 /** The parts' values on a common grid, in the range that is zoomed to; the whole range; and how many samples there are. */
@@ -64,7 +74,7 @@ export class Parts {
     const samples = wholes.reduce((sum, { drive }) => sum + drive.samples, 0);
     const archived = wholes.some(({ drive }) => drive.archive !== null);
     const fields = this.fields(shown, stream, grid, axis);
-    return { samples, archived, extent, x: grid, unit: UNITS[axis], hole: Infinity, fields };
+    return { samples, archived, extent, x: grid, along: UNITS[axis], hole: Infinity, fields };
   }
 
   /** The format of a field: the speed of the cars, if it is known of all of them. */

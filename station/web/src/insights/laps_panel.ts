@@ -5,7 +5,7 @@ import { el, panel, Text, table } from "../base/dom";
 import { capital, number, when } from "../base/format";
 import { inUs, type Range, same } from "../base/range";
 import { MOST_PARTS, offerComparison } from "../base/route";
-import { type Columns, dash, hue, LinesPanel } from "../charts/lines_panel";
+import { type Columns, LinesPanel } from "../charts/lines_panel";
 import { ask, Latest } from "../server/answers";
 import { words } from "./figures";
 
@@ -142,20 +142,10 @@ export class LapsPanel {
     columns: Columns,
     { places, unit: along }: DeltaAnswer,
   ): void {
-    const single = names.length === 1;
-    const curves = names.map((label, i) => ({
-      label,
-      colour: single ? "--accent" : `--${hue(i)}`,
-      dash: dash(i),
-    }));
-    const read = (index: number | null): void =>
-      drawn.read(columns.map((column) => number(column[index ?? places.length - 1] ?? NaN, digits)));
-    const drawn = new LinesPanel(
-      { title, unit, digits, along, curves, sync: SYNC, hole_s: Infinity, zero: single, onCursor: read },
-      places,
-      columns,
-      [0, places.at(-1) ?? 1],
-    );
+    const read = (index: number | null): void => drawn.read(index ?? places.length - 1);
+    const drawn = new LinesPanel({ title, sync: SYNC, zero: names.length === 1, onCursor: read });
+    const lines = names.map((label) => ({ label, unit, digits }));
+    drawn.draw({ x: places, along, hole: Infinity, columns, lines }, [0, places.at(-1) ?? 1]);
     read(null);
     this.charts.append(drawn.node);
     this.drawn.push(drawn);

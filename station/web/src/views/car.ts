@@ -242,7 +242,7 @@ export class CarView implements View<RouteTo<"car">> {
     this.services.drive.driven(robot?.driver(now));
     if (!robot) return;
     this.past.fill(robot, this.tools.window_s);
-    const charted = new Set(this.board.charts);
+    const charted = new Set(this.board.keys);
     for (const section of this.sections.values()) section.clock(now, charted);
     const screens = this.screens.column(1, now - MEDIAN_S);
     this.waterfall.refresh(robot, now, screens.length > 0 ? median(screens) : NaN);

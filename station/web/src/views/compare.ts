@@ -5,11 +5,12 @@ import { button, choices, el, Text, unserved } from "../base/dom";
 import { age, clockTime, number, when, zone } from "../base/format";
 import { type Range, same, writeTime } from "../base/range";
 import { MOST_PARTS, type Part, type RouteTo, readParts, route, setAddress, writeParts } from "../base/route";
-import { key } from "../charts/lines_panel";
+import { key, type Lines } from "../charts/lines_panel";
 import { AddPart } from "../history/add_part";
 import type { Axis } from "../history/align";
-import { FieldCharts } from "../history/field_charts";
-import { NoDistance, Parts } from "../history/parts";
+import { Chart, lineOf } from "../history/chart";
+import { chosen, Panels } from "../history/panels";
+import { type Charted, NoDistance, Parts } from "../history/parts";
 import { ask, Latest } from "../server/answers";
 import { type Services, type View, viewNode } from "./view";
 
@@ -19,7 +20,7 @@ const AXES = [
   ["distance", "Distance"],
 ] as const;
 const USUAL = ["speed", "current_motor", "duty_cycle", "voltage_input"];
-const MOST_CHARTS = 8;
+const [FIRST_CHARTS, MOST_CHARTS] = [6, 8];
 const UNSERVED =
   "This page was put on the web as it is, and cannot read the tables. To compare runs, run `iort dashboard`.";
 
@@ -34,12 +35,11 @@ export class CompareView implements View<RouteTo<"compare">> {
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly at = new Text("num");
   private readonly list = el("ul", { class: "parts" });
-  private readonly charts: FieldCharts;
+  private readonly charts: Panels<Charted>;
   private readonly add: AddPart;
   private readonly loader: Parts;
   private parts: readonly Part[] = [];
   private wanted: readonly string[] = [];
-  private grid: readonly number[] = [];
   private unit = "";
   private extent: Range = [0, 1];
   private zooms: Range[] = [];
@@ -51,21 +51,21 @@ export class CompareView implements View<RouteTo<"compare">> {
     const { config, table, fleet } = services;
     this.loader = new Parts(table, fleet);
     this.add = new AddPart(fleet, (part) => this.include(part));
-    this.charts = new FieldCharts({
-      spec: (field) => this.loader.spec(field, this.stream.value, this.parts),
-      hands: {
-        zoom: (to) => this.go(to),
-        move: (to, upright) => this.move(to, upright),
-        back: () => this.back(),
-        pick: () => undefined,
-      },
-      onCursor: (index) => index !== null && this.read(index),
-      onFields: () => {
-        this.wanted = this.charts.fields;
+    const touch = {
+      zoom: (to: Range) => this.go(to),
+      move: (to: Range, upright: boolean) => this.move(to, upright),
+      back: () => this.back(),
+      pick: () => undefined,
+      point: (at: number | null) => at !== null && this.read(at),
+    };
+    const label = (field: string): string => this.loader.spec(field, this.stream.value, this.parts).label;
+    this.charts = new Panels({
+      make: (field) =>
+        new Chart({ title: label(field), touch, lines: (charted) => this.lines(field, charted) }),
+      changed: () => {
+        this.wanted = this.charts.keys;
         this.write();
       },
-      sync: "compare",
-      usual: USUAL,
       most: MOST_CHARTS,
     });
     this.stream.addEventListener("change", () => this.restart());
@@ -216,15 +216,30 @@ export class CompareView implements View<RouteTo<"compare">> {
     signal.throwIfAborted();
     const { samples, archived, extent, ...charted } = compared;
     this.extent = extent;
-    [this.grid, this.unit] = [charted.x, charted.unit!];
-    this.charts.set({ ...charted, names: shortly(parts) }, zoom ?? extent, this.wanted);
+    this.unit = charted.along;
+    const fields = [...charted.fields.keys()];
+    const labels = fields.map((field) => [field, this.loader.spec(field, stream, parts).label] as const);
+    this.charts.show(
+      { ...charted, names: shortly(parts) },
+      zoom ?? extent,
+      chosen(fields, this.wanted, USUAL, FIRST_CHARTS),
+      new Map(labels),
+    );
     if (parts.length >= 2)
       this.note.set(
         samples === 0
           ? "Nothing was stored in these ranges."
           : `${number(samples)} samples${archived ? ", some from the archive" : ""}.`,
       );
-    this.read(0);
+    this.read((zoom ?? extent)[0]);
+  }
+
+  /** A line for each part; of a single one, with its minimum and maximum. */
+  private lines(field: string, { x, along, hole, fields, names }: Charted): Lines | undefined {
+    const columns = fields.get(field);
+    const spec = this.loader.spec(field, this.stream.value, this.parts);
+    const lines = names.map((name) => lineOf(spec, names.length === 1 ? spec.label : name));
+    return columns && { x, along, hole, columns, lines };
   }
 
   private showParts(): void {
@@ -251,11 +266,9 @@ export class CompareView implements View<RouteTo<"compare">> {
     );
   }
 
-  private read(index: number): void {
-    const at = this.grid[index];
-    if (at === undefined) return;
+  private read(at: number): void {
     this.at.set(this.parts.length === 0 ? "" : `at ${number(at, 2)} ${this.unit}`);
-    this.charts.read(index);
+    this.charts.point(at);
   }
 }
 

@@ -1,12 +1,22 @@
 // A car's past: a range from the cloud's table, to zoom into, to play, to save, and to compare with the live values.
 
-import type { HistoryAnswer, RunsAnswer, StreamsAnswer } from "../base/contract";
+import type {
+  FieldsAnswer,
+  HistoryAnswer,
+  RacelineAnswer,
+  RunsAnswer,
+  StreamsAnswer,
+} from "../base/contract";
 import { el, Text, unserved } from "../base/dom";
 import { age, number, when } from "../base/format";
 import { inUs, LEAST_S, type Range, readRange, readTime, rounded, same, writeTime } from "../base/range";
 import { type Query, type RouteTo, route, setAddress } from "../base/route";
 import type { Mark } from "../charts/range_chart";
+import type { Track } from "../charts/xy_chart";
+import { AlarmsPanel } from "../history/alarms_panel";
+import { LapsList } from "../history/laps_list";
 import { fromArchive, unread } from "../history/origin";
+import { Past } from "../history/past";
 import { RangeForm } from "../history/range_form";
 import { Result } from "../history/result";
 import { RunsList } from "../history/runs_list";
@@ -18,8 +28,6 @@ import { type Services, type View, viewNode } from "./view";
 
 // What is shown first, unless nothing was stored in it.
 const RECENT_S = 300;
-// The rows of a request: about the width of a chart in points.
-const ROWS = 1500;
 const RUNS = 20;
 // Panning loads once it has stopped for this long.
 const SETTLED_MS = 200;
@@ -37,6 +45,11 @@ export class HistoryView implements View<RouteTo<"history">> {
   private readonly result: Result;
   private readonly notes: NotesPanel;
   private readonly incidents: IncidentsPanel;
+  private readonly alarms: AlarmsPanel;
+  private readonly laps: LapsList;
+  /** The fields of the robot's streams, and the samples of the range, by stream with the rows that were asked for. */
+  private known: FieldsAnswer["streams"] = {};
+  private drives = new Map<string, { readonly rows: number; readonly drive: HistoryAnswer }>();
   /** People's notes have numbers, incidents have letters. */
   private marks: { readonly notes: readonly Mark[]; readonly incidents: readonly Mark[] } = {
     notes: [],
@@ -58,14 +71,29 @@ export class HistoryView implements View<RouteTo<"history">> {
       stream: () => this.choose(this.form.stream),
       out: () => this.zoomOut(),
     });
-    this.result = new Result(table, fleet, {
+    this.result = new Result({
+      config,
+      table,
+      fleet,
       hands: {
         zoom: (to) => this.zoom(to),
         move: (to, upright) => this.move(to, upright),
         back: () => this.zoomOut(),
       },
-      asked: () => this.asked(),
-      changed: () => this.write(),
+      range: () => this.range!,
+      asked: () => this.asked(this.form.stream),
+      line: config.track && config.answers ? raceline() : Promise.resolve(undefined),
+      changed: () => {
+        this.write();
+        if (this.lacking().length > 0) void this.load(this.range!, this.drives);
+      },
+      alarmed: () => void this.alarms.show(this.robot),
+    });
+    this.alarms = new AlarmsPanel(config);
+    this.laps = new LapsList({
+      asked: () => [this.robot, this.zooms[0] ?? this.range!],
+      zoom: (to) => this.lap(to),
+      out: () => this.zoomOut(),
     });
     this.notes = new NotesPanel(config, {
       at: () => (Number.isNaN(this.result.at) ? Math.min(this.range![1], Date.now() / 1000) : this.result.at),
@@ -84,9 +112,10 @@ export class HistoryView implements View<RouteTo<"history">> {
     });
     const served = [
       this.form.node,
-      this.runs.node,
+      el("div", { class: "history-lists" }, this.runs.node, this.laps.node),
       el("div", { class: "history-status" }, this.note.node, this.form.out),
       this.result.node,
+      this.alarms.node,
       this.notes.node,
       this.incidents.node,
     ];
@@ -131,8 +160,12 @@ export class HistoryView implements View<RouteTo<"history">> {
     this.result.clear();
     this.note.set("");
     this.runs.set(robot, undefined);
+    this.known = {};
+    this.drives.clear();
     this.form.node.inert = true;
-    if (this.services.config.answers) void this.enter(robot, query);
+    if (!this.services.config.answers) return;
+    void this.alarms.show(robot);
+    void this.enter(robot, query);
   }
 
   private mark(changed: Partial<typeof this.marks>): void {
@@ -147,6 +180,8 @@ export class HistoryView implements View<RouteTo<"history">> {
   /** Find the robot's streams and runs, and show what the address says, or the newest. */
   private async enter(robot: string, query: Query<"history">): Promise<void> {
     const runs = this.findRuns();
+    // Without it there are only the fields of the main stream.
+    const fields = ask<FieldsAnswer>("fields", { robot }).catch(() => undefined);
     this.note.set("Looking for what is stored …");
     await this.loading.run(
       async (signal) => {
@@ -163,10 +198,11 @@ export class HistoryView implements View<RouteTo<"history">> {
         this.form.streams(streams);
         this.form.stream = stream;
         this.runs.show(stream);
-        this.result.wanted = query.fields?.split(",") ?? [];
+        this.result.read(stream, query.fields);
         this.result.at = readTime(query.at);
         const range = readRange(query.from, query.to);
         if (!range) await runs;
+        this.known = (await fields)?.streams ?? {};
         signal.throwIfAborted();
         this.go(range ?? this.newest());
       },
@@ -204,7 +240,8 @@ export class HistoryView implements View<RouteTo<"history">> {
     const before = this.form.stream;
     if (query.stream !== undefined) this.form.stream = query.stream;
     if (this.form.stream !== before) this.runs.show(this.form.stream);
-    this.result.wanted = query.fields?.split(",") ?? this.result.wanted;
+    if (query.fields !== undefined || this.form.stream !== before)
+      this.result.read(this.form.stream, query.fields);
     if (query.at !== undefined) this.result.at = readTime(query.at);
     const range = readRange(query.from, query.to) ?? this.range!;
     if (same(range, this.zooms.at(-1))) this.zooms.pop();
@@ -213,7 +250,7 @@ export class HistoryView implements View<RouteTo<"history">> {
   }
 
   private choose(stream: string): void {
-    this.result.wanted = [];
+    this.result.read(stream, undefined);
     this.zooms = [];
     this.runs.show(stream);
     this.go(this.range ?? this.newest(), true);
@@ -233,6 +270,12 @@ export class HistoryView implements View<RouteTo<"history">> {
     this.zooms.push(this.range!);
     const lacking = LEAST_S - (to[1] - to[0]);
     this.go(lacking > 0 ? [to[0] - lacking / 2, to[1] + lacking / 2] : to, true);
+  }
+
+  /** Show a lap alone; the laps of the range stay those to choose from. */
+  private lap(to: Range): void {
+    if (this.zooms.length === 0) this.zooms.push(this.range!);
+    this.go(to, true);
   }
 
   private zoomOut(): void {
@@ -263,6 +306,7 @@ export class HistoryView implements View<RouteTo<"history">> {
     if (!(this.range[0] <= this.result.at && this.result.at <= this.range[1])) this.result.at = NaN;
     this.result.move(this.range);
     this.form.show(this.range, this.zooms.length > 0);
+    this.laps.show(this.range);
     this.write(step);
     void this.load(this.range);
   }
@@ -280,21 +324,43 @@ export class HistoryView implements View<RouteTo<"history">> {
     );
   }
 
-  private asked(): Readonly<Record<string, string>> {
-    return { robot: this.robot, stream: this.form.stream, ...inUs(this.range!) };
+  private asked(stream: string): Readonly<Record<string, string>> {
+    return { robot: this.robot, stream, ...inUs(this.range!) };
   }
 
-  private async load(range: Range): Promise<void> {
-    void this.notes.show(this.robot, range);
-    this.incidents.show(this.robot, range);
+  /** The streams that the panels need, and that are not loaded, or in fewer rows. */
+  private lacking(): (readonly [stream: string, rows: number])[] {
+    const { stream } = this.form;
+    const known = (name: string): boolean => name === stream || Object.hasOwn(this.known, name);
+    return [...this.result.needs(stream, this.known)].filter(
+      ([name, rows]) => known(name) && (this.drives.get(name)?.rows ?? 0) < rows,
+    );
+  }
+
+  /** Load what the panels need of a range, beside what is `there`. */
+  private async load(range: Range, there: typeof this.drives = new Map()): Promise<void> {
+    this.drives = there;
+    if (there.size === 0) {
+      void this.notes.show(this.robot, range);
+      this.incidents.show(this.robot, range);
+    }
     this.note.set("Loading …");
     const began = performance.now();
+    const { stream: main } = this.form;
     await this.loading.run(
       async (signal) => {
-        const asked = { ...this.asked(), rows: String(ROWS) };
-        const drive = await ask<HistoryAnswer>("history", asked, signal);
-        if (drive.samples === 0) this.result.clear();
-        else this.result.set(this.robot, this.form.stream, drive, range);
+        const each = this.lacking().map(async ([stream, rows]) => {
+          const asked = { ...this.asked(stream), rows: String(rows) };
+          const drive = await ask<HistoryAnswer>("history", asked, signal);
+          return [stream, { rows, drive }] as const;
+        });
+        for (const [stream, answer] of await Promise.all(each)) there.set(stream, answer);
+        const drives = new Map([...there].map(([stream, { drive }]) => [stream, drive]));
+        const { table, fleet } = this.services;
+        const past = new Past(table, fleet, this.robot, main, this.known, drives);
+        const drive = drives.get(main)!;
+        if ([...drives.values()].every(({ samples }) => samples === 0)) this.result.clear();
+        else this.result.set(past, range);
         const after_s = (performance.now() - began) / 1000;
         this.note.set(drive.samples === 0 ? this.nothing() : about(drive, range, after_s));
       },
@@ -306,6 +372,17 @@ export class HistoryView implements View<RouteTo<"history">> {
     const extent = this.runs.extent(this.form.stream);
     const [from, to] = extent?.map((at) => when(at)) ?? [];
     return `Nothing was stored in this range.${extent ? ` ${this.form.stream} is stored from ${from} to ${to}.` : ""}`;
+  }
+}
+
+/** The fastest line on the page's track; undefined if there is none. */
+async function raceline(): Promise<Track | undefined> {
+  try {
+    const { x_m, y_m } = await ask<RacelineAnswer>("raceline", {});
+    // It is closed.
+    return x_m.length > 0 ? { x: [...x_m, x_m[0]!], y: [...y_m, y_m[0]!] } : undefined;
+  } catch {
+    return undefined;
   }
 }
 

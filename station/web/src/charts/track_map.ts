@@ -1,7 +1,7 @@
 // The track's edges, from its centre line and widths.
 
 import type { TrackMap } from "../base/contract";
-import type { Track } from "../charts/xy_chart";
+import type { Track } from "./xy_chart";
 
 /** The left and the right edge of a closed track; their first point is the last one, too. */
 export function edges({ x_m, y_m, w_right_m, w_left_m }: TrackMap): [Track, Track] {

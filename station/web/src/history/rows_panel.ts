@@ -1,0 +1,232 @@
+// The rows of a stream around the playhead, as a table: to sort, and to copy as CSV.
+
+import type { Value } from "../base/contract";
+import { button, el, panel, setAttribute, Text } from "../base/dom";
+import { dayTime, number, type Spec, write } from "../base/format";
+import type { Range } from "../base/range";
+import { lastAt } from "../charts/plane";
+import { speak, stepped } from "../charts/spoken";
+import type { Panel, Touch } from "./panels";
+import type { Past } from "./past";
+
+const TABLE = "table";
+// Rows that are in the page at a time: around the playhead, or the first in the order of a column.
+const SHOWN = 100;
+
+export const rowsKey = (stream: string): string => `${TABLE}:${stream}`;
+export const rowsStream = (key: string): string | undefined =>
+  key.startsWith(`${TABLE}:`) ? key.slice(TABLE.length + 1) || undefined : undefined;
+
+interface Column {
+  readonly name: string;
+  readonly spec: Spec;
+  readonly values: readonly Value[];
+}
+
+export class RowsPanel implements Panel<Past> {
+  readonly title: string;
+  readonly node: HTMLElement;
+  private readonly note = new Text("note");
+  private readonly said = new Text("note", "span", { role: "status" });
+  private readonly head = el("tr");
+  private readonly body = el("tbody");
+  private readonly box = el(
+    "div",
+    { class: "rows", tabindex: "0", role: "region" },
+    el("table", {}, el("thead", {}, this.head), this.body),
+  );
+  private times: readonly number[] = [];
+  private columns: readonly Column[] = [];
+  private range: Range = [0, 1];
+  /** The rows of the range, in their order, and the first of those that are in the page. */
+  private order: number[] = [];
+  private from = 0;
+  private sort: { readonly column: string; readonly down: boolean } = { column: "", down: false };
+  private index = -1;
+  private keyed = false;
+
+  constructor(
+    private readonly stream: string,
+    private readonly touch: Touch,
+  ) {
+    this.title = `Table of ${stream}`;
+    const copy = button("Copy CSV", () => void this.copy(), { title: "Copy the rows of the range as CSV" });
+    setAttribute(this.box, "aria-label", `Rows of ${stream}`);
+    this.node = panel(this.title, "rows-panel", [this.note.node, this.said.node, copy], this.box);
+    this.body.addEventListener("click", ({ target }) => {
+      const at = Number((target as Element).closest("tr")?.dataset.row ?? NaN);
+      if (Number.isNaN(at)) return;
+      touch.point(this.times[at]!);
+      touch.pick();
+    });
+    this.box.addEventListener("keydown", (event) => this.key(event));
+    this.box.addEventListener("blur", () => {
+      if (this.keyed) touch.pick();
+      this.keyed = false;
+    });
+  }
+
+  set(past: Past, range: Range): boolean {
+    const drive = past.drives.get(this.stream);
+    if (!drive || drive.times_s.length === 0) return false;
+    this.times = drive.times_s;
+    this.columns = past.shown(this.stream).map((name) => {
+      const key = past.key(this.stream, name);
+      return { name, spec: past.spec(key), values: drive.fields[name]!.mean };
+    });
+    this.index = -1;
+    this.heading();
+    this.move(range);
+    return true;
+  }
+
+  move(range: Range): void {
+    this.range = range;
+    const inside = (at: number): boolean => this.range[0] <= at && at <= this.range[1];
+    this.order = [...this.times.keys()].filter((row) => inside(this.times[row]!));
+    const column = this.columns.find(({ name }) => name === this.sort.column);
+    const sign = this.sort.down ? -1 : 1;
+    if (column)
+      this.order.sort(
+        (a, b) => sign * compared(column.values[a] ?? null, column.values[b] ?? null, sign) || a - b,
+      );
+    else if (this.sort.down) this.order.reverse();
+    this.fill(0);
+    const shown = Math.min(SHOWN, this.order.length);
+    this.note.set(
+      shown < this.order.length ? `${shown} of ${number(this.order.length)} rows` : `${shown} rows`,
+    );
+  }
+
+  point(at: number): void {
+    this.index = this.times.length > 0 ? lastAt(this.times, at) : -1;
+    const place = this.order.indexOf(this.index);
+    // In the order of time the rows go along with the playhead.
+    const outside = place < this.from || place >= this.from + SHOWN;
+    if (place >= 0 && outside && !this.sort.column) this.fill(place - SHOWN / 2);
+    this.light();
+  }
+
+  destroy(): void {
+    this.touch.point(null);
+  }
+
+  private fill(first: number): void {
+    this.from = Math.max(0, Math.min(first, this.order.length - SHOWN));
+    this.body.replaceChildren(
+      ...this.order
+        .slice(this.from, this.from + SHOWN)
+        .map((row) =>
+          el(
+            "tr",
+            { "data-row": String(row) },
+            el(
+              "th",
+              { scope: "row", class: "num" },
+              dayTime(this.times[row]!, { fractionalSecondDigits: 3 }),
+            ),
+            ...this.columns.map(({ values, spec }) => el("td", { class: "num" }, write(values[row], spec))),
+          ),
+        ),
+    );
+    this.light();
+  }
+
+  /** Show where the playhead is. */
+  private light(): void {
+    this.body.querySelector("[aria-current]")?.removeAttribute("aria-current");
+    const row = this.body.children[this.order.indexOf(this.index) - this.from];
+    if (!row) return;
+    row.setAttribute("aria-current", "true");
+    // The page itself does not move for it.
+    const { box } = this;
+    const [top, height] = [(row as HTMLElement).offsetTop, (row as HTMLElement).offsetHeight];
+    const head = this.head.offsetHeight;
+    if (top - head < box.scrollTop || top + height > box.scrollTop + box.clientHeight)
+      box.scrollTop = top - box.clientHeight / 2;
+  }
+
+  private heading(): void {
+    const cell = (name: string, label: string, unit: string): HTMLElement => {
+      const { column, down } = this.sort;
+      const sorted = column === name ? (down ? "descending" : "ascending") : "none";
+      const sort = button(unit ? `${label}, ${unit}` : label, () => this.by(name), { class: "sort" });
+      return el("th", { scope: "col", "aria-sort": sorted }, sort);
+    };
+    this.head.replaceChildren(
+      cell("", "Time", ""),
+      ...this.columns.map(({ name, spec }) => cell(name, spec.label, spec.unit)),
+    );
+  }
+
+  private by(column: string): void {
+    this.sort = { column, down: this.sort.column === column && !this.sort.down };
+    const focused = [...this.head.children].findIndex((each) => each.contains(document.activeElement));
+    this.heading();
+    (this.head.children[focused]?.firstElementChild as HTMLElement | null)?.focus();
+    this.move(this.range);
+    this.box.scrollTop = 0;
+  }
+
+  private key(event: KeyboardEvent): void {
+    const keys: Readonly<Record<string, string>> = { ArrowUp: "ArrowLeft", ArrowDown: "ArrowRight" };
+    const { shiftKey } = event;
+    const place = Math.max(0, this.order.indexOf(this.index));
+    const to =
+      event.target === this.box
+        ? stepped({ key: keys[event.key] ?? event.key, shiftKey }, place, 0, this.order.length - 1)
+        : undefined;
+    if (to === undefined) return;
+    const row = this.order[to]!;
+    this.keyed = true;
+    if (this.sort.column && (to < this.from || to >= this.from + SHOWN)) this.fill(to - SHOWN / 2);
+    this.touch.point(this.times[row]!);
+    const values = this.columns.map(({ spec, values }) =>
+      `${spec.label} ${write(values[row], spec)} ${spec.unit}`.trim(),
+    );
+    speak(`${dayTime(this.times[row]!, { fractionalSecondDigits: 1 })}: ${values.join(", ")}`);
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
+  /** Copy all rows of the range, in their order, in the units that are shown. */
+  private async copy(): Promise<void> {
+    const quoted = (text: string): string => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+    const head = [
+      "time",
+      ...this.columns.map(({ name, spec }) => (spec.unit ? `${name} (${spec.unit})` : name)),
+    ];
+    const rows = this.order.map((row) => [
+      iso(this.times[row]!),
+      ...this.columns.map(({ values, spec }) => plain(values[row] ?? null, spec)),
+    ]);
+    const text = [head, ...rows].map((cells) => cells.map(quoted).join(",")).join("\n");
+    try {
+      await navigator.clipboard.writeText(`${text}\n`);
+      this.said.set(`Copied ${number(rows.length)} rows.`);
+    } catch {
+      // Without HTTPS on another computer, or without the right, a browser gives no clipboard.
+      this.said.set("This browser does not let the page copy: Download saves the range as CSV.");
+    }
+  }
+}
+
+/** A time as a file has it, to the microsecond. */
+function iso(at: number): string {
+  const us = Math.round(at * 1e6);
+  const second = new Date(Math.floor(us / 1e6) * 1000).toISOString().slice(0, 19);
+  return `${second}.${String(us % 1e6).padStart(6, "0")}Z`;
+}
+
+/** A value as a file has it: a plain number in the unit that is shown. */
+function plain(value: Value, { scale, shift }: Spec): string {
+  if (value === null) return "";
+  return typeof value === "number" ? String(Number((value * scale + shift).toPrecision(12))) : String(value);
+}
+
+/** Numbers before texts, and what is missing last, whatever the `sign` of the order. */
+function compared(one: Value, other: Value, sign: number): number {
+  if (one === null || other === null) return sign * (Number(one === null) - Number(other === null));
+  if (typeof one === "number" && typeof other === "number") return one - other;
+  return String(one).localeCompare(String(other), "en", { numeric: true });
+}
