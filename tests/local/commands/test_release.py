@@ -1,4 +1,4 @@
-"""What is released, installed away from the checkout: the manual's commands, the page, a robot's wheelhouse.
+"""The released packages, installed away from the checkout: the manual's commands, and the page.
 
 `make release` runs this on dist/ (IORT_DIST); otherwise the tests build what they look at.
 """
@@ -7,22 +7,19 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import re
 import signal
 import subprocess
 import sys
-import tarfile
 from importlib.metadata import distributions
 from pathlib import Path
 from urllib.request import urlopen
-from zipfile import ZipFile
 
 import pytest
 
 from iort_station.cloud import EMBEDDED
 from local.cloud import EmbeddedCloud
-from scripts import release, wheelhouse
+from scripts import release
 from testkit import ROOT
 from testkit.waiting import until
 
@@ -244,80 +241,3 @@ def test_each_environment_lacks_the_other_ones_packages(agent, station):
     assert not (agent.site / "iort_station").exists()
     assert not (station.site / "iort_agent").exists()
     assert not (agent.site / "boto3").exists(), "an environment has only declared packages"
-
-
-@pytest.fixture(scope="module", params=wheelhouse.ARCHITECTURES)
-def house(request: pytest.FixtureRequest, dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The unpacked wheelhouse of an architecture."""
-    folder = tmp_path_factory.mktemp(request.param)
-    archive = next(dist.glob(f"iort-wheelhouse-*-{request.param}.tar"), None)
-    archive = archive or wheelhouse.make(request.param, dist.glob("*.whl"), folder)
-    with tarfile.open(archive) as packed:
-        packed.extractall(folder, filter="data")
-    (found,) = (path for path in folder.iterdir() if path.is_dir())
-    return found
-
-
-# The ELF header's number of a machine.
-ELF = {"aarch64": 183, "x86_64": 62}
-
-
-def test_a_wheelhouse_has_all_that_each_python_of_its_architecture_needs(house, tmp_path):
-    architecture = house.name.rpartition("-")[2]
-    assert {path.suffix for path in house.iterdir()} == {".whl", ".sh", ".txt"}
-    for python in wheelhouse.PYTHONS:
-        # Fails if anything is missing here, or in the list with the hashes.
-        ran(
-            *(
-                UV,
-                "pip",
-                "install",
-                "--offline",
-                "--no-index",
-                "--find-links",
-                house,
-                "--only-binary",
-                ":all:",
-            ),
-            *(
-                "--dry-run",
-                "--target",
-                tmp_path,
-                "--require-hashes",
-                "--requirement",
-                house / "requirements.txt",
-            ),
-            *("--python-version", f"{python}.10", "--python-platform", f"{architecture}-manylinux_2_31"),
-        )
-    heads = []
-    for wheel in house.glob("*.whl"):
-        with ZipFile(wheel) as packed:
-            heads += [packed.read(name)[:20] for name in packed.namelist() if re.search(r"\.so(\.|$)", name)]
-    assert len(heads) > len(wheelhouse.PYTHONS)
-    machines = {(head[:4], int.from_bytes(head[18:20], "little")) for head in heads}
-    assert machines == {(b"\x7fELF", ELF[architecture])}
-
-
-def test_a_wheelhouse_is_installed_without_a_network(house, tmp_path):
-    if platform.machine() not in house.name:
-        said = subprocess.run(
-            ["sh", house / "install.sh", tmp_path], capture_output=True, text=True, check=False
-        )
-        assert (said.returncode, said.stderr.split(",")[0]) == (
-            1,
-            f"install.sh: these packages are for {house.name.rpartition('-')[2]}",
-        )
-        return
-    oldest = ROOT / "build" / "oldest" / "bin" / "python"
-    for python in filter(Path.exists, (oldest, Path(sys.executable))):
-        environment = tmp_path / python.parts[-3]
-        # Nowhere to go, should something ask for an index after all.
-        nowhere = {
-            "PYTHON": str(python),
-            "https_proxy": "http://127.0.0.1:9",
-            "http_proxy": "http://127.0.0.1:9",
-        }
-        assert ran("sh", house / "install.sh", environment, **nowhere) == f"iort-agent {release.version()}"
-        # A second run updates it.
-        assert ran("sh", house / "install.sh", environment, **nowhere)
-        ran(environment / "bin" / "python", "-c", IMPORT_ALL, ",".join(ROS), "iort_contract,iort_agent")
