@@ -16,15 +16,16 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 DIST = ROOT / "dist"
 DISTRIBUTIONS = ("contract", "device", "analysis", "station")
-# Installs them into an empty environment, and runs what the manual tells a user to type.
+# They install packages and wheelhouses into empty environments, and run what the manual tells a user to type.
 PROOF = "tests/local/commands/test_release.py"
+PROOF_OF_WHEELHOUSES = "tests/local/test_wheelhouse.py"
 _PAGE = "iort_station/page/built/index.html"
 _NUMBER = r"\d+\.\d+\.\d+"
 # Where a distribution states a version, of itself or of another one.
@@ -157,13 +158,13 @@ def sums(files: Iterable[Path], out: Path) -> None:
     (out / "SHA256SUMS").write_text("".join(lines))
 
 
-def release(*, architectures: Iterable[str], tag: bool) -> None:
+def release(*, architectures: Sequence[str], tag: bool) -> None:
     """Build into dist/, check it, install it and run the manual's commands with it; then tag, if asked."""
     refuse(tag=tag)
     built = make(architectures)
     check(built)
-    proof = [sys.executable, "-m", "pytest", "-q", PROOF]
-    _run(*proof, show=True, IORT_DIST=str(DIST))
+    tests = [PROOF, *([PROOF_OF_WHEELHOUSES] if architectures else [])]
+    _run(sys.executable, "-m", "pytest", *tests, show=True, IORT_DIST=str(DIST))
     if tag:
         _git(ROOT, "tag", "--annotate", f"v{version()}", "--message", f"iort {version()}")
         print(f"tagged v{version()}; `git push origin v{version()}` publishes the tag")

@@ -145,7 +145,11 @@ def test_what_is_built_passes_the_checks_of_the_index(dist):
 
 
 def test_the_same_commit_gives_the_same_bytes(dist, tmp_path):
-    again = release.build(tmp_path)
+    usual = os.umask(0o077)
+    try:
+        again = release.build(tmp_path)
+    finally:
+        os.umask(usual)
     assert {path.name: path.read_bytes() for path in again} == {
         path.name: (dist / path.name).read_bytes() for path in again
     }
