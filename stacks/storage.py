@@ -55,6 +55,8 @@ class Storage(PlatformStack):
         )
         self.findings = self._table("Findings", partition=ROBOT, sort=FINDING, sort_type=_TEXT)
         self.files = self._files()
+        # Who imports recordings gives them the rest of their time in the table.
+        CfnOutput(self, "RetentionDays", value=str(settings.retention_days))
 
     def _table(
         self,

@@ -47,6 +47,11 @@ class ArchiveFile:
         """The hours in the file."""
         return list(self._hours)
 
+    @property
+    def rows(self) -> int:
+        """The samples in the file."""
+        return int(self._file.metadata.num_rows)
+
     def groups(self, hour: Hour | None = None) -> range:
         """The row groups of an hour."""
         if hour is None:

@@ -30,12 +30,11 @@ _TYPES["?"] = np.dtype("u1")
 
 class Flat(NamedTuple):
     """Messages as columns. ``shapes`` are the names that some messages have, in order, and ``shape_of`` has
-    each message's; ``nulled`` counts the values of each that were not finite."""
+    each message's."""
 
     columns: dict[str, Column]
     shapes: Sequence[Sequence[str]]
     shape_of: NDArray[np.intp]
-    nulled: NDArray[np.int64]
 
 
 class Flattener:
@@ -52,7 +51,7 @@ class Flattener:
         n = len(raws)
         parts: list[tuple[NDArray[np.intp], dict[str, Column]]] = []
         shapes: list[Sequence[str]] = []
-        shape_of, nulled = np.zeros(n, dtype=np.intp), np.zeros(n, dtype=np.int64)
+        shape_of = np.zeros(n, dtype=np.intp)
         sizes = np.fromiter(map(len, raws), dtype=np.int64, count=n)
         rest = []
         for size in np.unique(sizes).tolist() if self._kind.decoder is not None else ():
@@ -63,20 +62,20 @@ class Flattener:
                     rest.append(rows[:1] if len(parts) < _MOST_FORMS else rows)
                     rows = rows[len(rest[-1]) :]
                     continue
-                same, columns, lost = _read(form, raws, rows, size)
-                shape_of[same], nulled[same] = len(shapes), lost
+                same, columns = _read(form, raws, rows, size)
+                shape_of[same] = len(shapes)
                 shapes.append(list(columns))
                 parts.append((same, columns))
                 rows = np.setdiff1d(rows, same, assume_unique=True)
         for row in np.concatenate(rest).tolist() if rest else ():
-            found, lost_one = view(Messages(self._kind.id, self._kind.layout, [raws[row]]))
-            shape_of[row], nulled[row] = len(shapes), lost_one
+            found, _ = view(Messages(self._kind.id, self._kind.layout, [raws[row]]))
+            shape_of[row] = len(shapes)
             shapes.append(list(found))
             own = {name: _exact(column) for name, column in found.items()}
             parts.append((np.array([row]), own))
         if not parts:
-            return Flat({}, [()], shape_of, nulled)
-        return Flat(_together(parts, n), shapes, shape_of, nulled)
+            return Flat({}, [()], shape_of)
+        return Flat(together(parts, n), shapes, shape_of)
 
     def _form(self, raw: bytes) -> Form | None:
         """The form of a message; None for one that is read by itself."""
@@ -94,9 +93,8 @@ class Flattener:
 
 def _read(
     form: Form, raws: Sequence[bytes], rows: NDArray[np.intp], size: int
-) -> tuple[NDArray[np.intp], dict[str, Column], NDArray[np.int64]]:
-    """Which of these messages, all of one size, have the form of the first; their columns; and how many
-    values of each were not finite."""
+) -> tuple[NDArray[np.intp], dict[str, Column]]:
+    """Which of these messages, all of one size, have the form of the first; and their columns."""
     chosen = [raws[row] for row in rows.tolist()]
     data = np.frombuffer(b"".join(chosen), dtype=np.uint8).reshape(len(chosen), size)
     same = np.ones(len(chosen), dtype=np.bool_)
@@ -104,12 +102,11 @@ def _read(
         same &= (data[:, begin:end] == data[0, begin:end]).all(axis=1)
     if not same.all():
         rows, data = rows[same], data[same]
-    lost = np.zeros(len(rows), dtype=np.int64)
-    columns = {name: _column(place, data, lost) for name, place in form.fields.items()}
-    return rows, columns, lost
+    columns = {name: _column(place, data) for name, place in form.fields.items()}
+    return rows, columns
 
 
-def _column(place: Place | Value, data: NDArray[np.uint8], lost: NDArray[np.int64]) -> Column:
+def _column(place: Place | Value, data: NDArray[np.uint8]) -> Column:
     if not isinstance(place, Place):
         return objects([place] * len(data))
     kind = _TYPES[place.letter]
@@ -123,7 +120,6 @@ def _column(place: Place | Value, data: NDArray[np.uint8], lost: NDArray[np.int6
     floats = numbers.astype(np.float64) + 0.0
     if kind.kind == "f" and not (finite := np.isfinite(floats)).all():
         floats[~finite] = np.nan
-        lost += ~finite
     return floats
 
 
@@ -132,7 +128,7 @@ def _exact(column: Sequence[Value]) -> Column:
     return objects(column) if large else column_of(column)
 
 
-def _together(parts: Sequence[tuple[NDArray[np.intp], dict[str, Column]]], n: int) -> dict[str, Column]:
+def together(parts: Sequence[tuple[NDArray[np.intp], dict[str, Column]]], n: int) -> dict[str, Column]:
     """The columns of all messages, of which each part has some."""
     if len(parts) == 1 and len(parts[0][0]) == n:
         # In order: the rows of one size are.

@@ -115,6 +115,10 @@ class Recording:
             raise
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files."""
         self._reader.close()
 
     def _streams(self) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from decimal import Decimal
 from typing import Any, NamedTuple
@@ -147,6 +147,20 @@ def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[
     except dynamodb.exceptions.ConditionalCheckFailedException as error:
         raise not_registered(cloud, robot) from error
     return {name: float(value) for name, value in plain(answer.get("Attributes", {})).items()}
+
+
+def note_streams(cloud: Cloud, robot: str, names: Sequence[str]) -> None:
+    """Note in a registered robot's row that it has these streams, as Lambda 2 does."""
+    added = {":streams": {"SS": sorted(set(names))}}
+    dynamodb = cloud.client("dynamodb")
+    dynamodb.update_item(
+        TableName=_table(cloud),
+        Key=_key(robot),
+        UpdateExpression="ADD #streams :streams",
+        ConditionExpression="attribute_exists(#robot)",
+        ExpressionAttributeNames={"#streams": tables.STREAMS, "#robot": tables.ROBOT},
+        ExpressionAttributeValues=added,
+    )
 
 
 def set_moved(cloud: Cloud, robot: str, origin: str) -> None:

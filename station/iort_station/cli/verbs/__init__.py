@@ -49,6 +49,7 @@ VERBS = {
     "doctor": ("upkeep", "Say what is wrong with the cloud, or will be, and what to do."),
     "backup": ("upkeep", "Write the cloud of `make up` into one file, while it runs."),
     "restore": ("upkeep", "Make the cloud of `make up` from a backup."),
+    "import": ("imports", "Import recordings, as if the robot had driven."),
     "move": ("move", "Copy robots and their recordings into another cloud."),
     "send": ("control", "Send a command and print the robot's answer."),
     "drive": ("drive", "Drive a car by the keys of this terminal."),
