@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 
 from iort_contract.messages import insights as messages
@@ -21,6 +22,8 @@ from iort_station.page.requests import robot_of, text, whole
 
 _MOST = 100
 _DAY_US = 86_400_000_000
+# As often as a page asks.
+COUNTED_S = 25.0
 # A robot that is connected looks once a second.
 _ANSWER_S = 15.0
 
@@ -33,10 +36,28 @@ def incidents(cloud: Cloud, request: Mapping[str, str]) -> messages.IncidentsAns
     return {"incidents": [_entry(one) for one in found[:_MOST]], "found": len(found)}
 
 
-def counts(cloud: Cloud) -> messages.IncidentCounts:
-    """How many incidents of the last day each robot has."""
-    since_us = time.time_ns() // 1000 - _DAY_US
-    return {"counts": dict(Counter(one.robot for one in stored.incidents(cloud, start_us=since_us)))}
+class Counts:
+    """How many incidents of the last day each robot has. It reads them for all viewers, one at a time, and
+    not again within `COUNTED_S`: every robot's stream is read for it."""
+
+    def __init__(self, cloud: Cloud, clock: Callable[[], float] = time.monotonic) -> None:
+        self._cloud, self._clock = cloud, clock
+        self._reading = threading.Lock()
+        # When it was read, and the answer; it is replaced as a whole.
+        self._newest: tuple[float, messages.IncidentCounts] | None = None
+
+    def answer(self) -> messages.IncidentCounts:
+        """The counts; while somebody else reads, those from before."""
+        newest = self._newest
+        if newest is not None and (self._clock() < newest[0] + COUNTED_S or self._reading.locked()):
+            return newest[1]
+        with self._reading:
+            if self._newest is newest:
+                since_us, began = time.time_ns() // 1000 - _DAY_US, self._clock()
+                found = stored.incidents(self._cloud, start_us=since_us)
+                self._newest = began, {"counts": dict(Counter(one.robot for one in found))}
+            assert self._newest is not None
+            return self._newest[1]
 
 
 def keep(cloud: Cloud, request: Mapping[str, str]) -> Generator[None, None, messages.KeepAnswer]:
@@ -56,12 +77,13 @@ def download(cloud: Cloud, request: Mapping[str, str], folder: Path) -> Path:
     one = next((one.incident for one in found if one.incident.id == id_), None)
     if one is None or one.state != UPLOADED:
         raise StationError(f"{robot} has uploaded no incident {id_[:40]}")
-    if one.bytes > MOST_BYTES:
-        raise StationError(f"it has over {MOST_BYTES:,} bytes: run `iort incidents get {one.id}`")
     file = files.stored(cloud, one.key)
     # The robot itself has named the key.
     if file is None or file.robot != robot:
         raise StationError(f"the file of {one.id} is not in the bucket any more")
+    # And it has said how large the file is.
+    if file.size > MOST_BYTES:
+        raise StationError(f"it has over {MOST_BYTES:,} bytes: run `iort incidents get {one.id}`")
     return files.download(cloud, file, folder)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -63,6 +65,65 @@ def test_the_last_days_incidents_are_counted_by_robot(lab):
     assert answers(lab)["incident_counts"]({}) == {"counts": {"car": 2, "van": 1}}
 
 
+class Held:
+    """Counts the questions to a lab's table, and answers them while it ``may``."""
+
+    def __init__(self, lab):
+        self.asked, self.may = 0, threading.Event()
+        self.begun = threading.Event()
+        self.may.set()
+        self._query, lab.table.query = lab.table.query, self.query
+
+    def query(self, **given):
+        self.asked += 1
+        self.begun.set()
+        assert self.may.wait(30)
+        return self._query(**given)
+
+
+def test_they_are_counted_once_for_all_viewers_and_again_after_a_while(lab):
+    now, held = [0.0], Held(lab)
+    counts = page.Counts(lab, clock=lambda: now[0])
+    with ThreadPoolExecutor(8) as viewers:
+        assert list(viewers.map(lambda _: counts.answer(), range(8))) == [{"counts": {}}] * 8
+    once = held.asked
+    # A question a robot.
+    assert 0 < once < 8
+    now_us = time.time_ns() // 1000
+    lab.tell(incident(1, start_us=now_us - 60 * S), now_us - 60 * S)
+    now[0] = page.COUNTED_S - 1
+    assert counts.answer() == {"counts": {}}
+    assert held.asked == once
+    now[0] = page.COUNTED_S
+    assert counts.answer() == {"counts": {"car": 1}}
+
+
+def test_who_asks_while_they_are_counted_gets_the_last_ones(lab):
+    now, held = [0.0], Held(lab)
+    counts = page.Counts(lab, clock=lambda: now[0])
+    assert counts.answer() == {"counts": {}}
+    held.may.clear()
+    held.begun.clear()
+    now_us = time.time_ns() // 1000
+    lab.tell(incident(1, start_us=now_us), now_us)
+    now[0] = page.COUNTED_S
+    with ThreadPoolExecutor(1) as reader:
+        reading = reader.submit(counts.answer)
+        assert held.begun.wait(30)
+        assert counts.answer() == {"counts": {}}
+        held.may.set()
+        assert reading.result() == {"counts": {"car": 1}}
+
+
+def test_a_failure_to_count_is_told_and_not_kept(lab):
+    counts, query = page.Counts(lab), lab.table.query
+    lab.table.query = lambda **_: (_ for _ in ()).throw(StationError("no such right"))
+    with pytest.raises(StationError):
+        counts.answer()
+    lab.table.query = query
+    assert counts.answer() == {"counts": {}}
+
+
 def test_an_uploaded_incident_is_downloaded_and_checked(lab, s3, tmp_path, monkeypatch):
     lab.bucket = s3
     digest = hashlib.sha256(CONTENT).hexdigest()
@@ -80,9 +141,14 @@ def test_an_uploaded_incident_is_downloaded_and_checked(lab, s3, tmp_path, monke
     lab.tell(incident(2, UPLOADED, key=key, bytes=8), START, robot="van")
     with pytest.raises(StationError, match="not in the bucket any more"):
         download({**asked, "robot": "van", "id": "00000002"}, tmp_path)
+    # The size is that of the file, whatever the robot has said of it.
+    lab.tell(incident(3, UPLOADED, key=key, bytes=1), START + S)
+    monkeypatch.setattr(page, "MOST_BYTES", 8)
+    assert download({**asked, "id": "00000003"}, tmp_path) == path
     monkeypatch.setattr(page, "MOST_BYTES", 7)
-    with pytest.raises(StationError, match="over 7 bytes: run `iort incidents get 00000001`"):
-        download(asked, tmp_path)
+    for id_ in ("00000001", "00000003"):
+        with pytest.raises(StationError, match=f"over 7 bytes: run `iort incidents get {id_}`"):
+            download({**asked, "id": id_}, tmp_path)
     s3.delete_object(Bucket=FILES, Key=key)
     monkeypatch.undo()
     with pytest.raises(StationError, match="not in the bucket any more"):
