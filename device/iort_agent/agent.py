@@ -124,6 +124,8 @@ class Agent:
         # Why the recorder does not work, although the configuration has one.
         self.no_recorder: str | None = None
         self.recorder = self._make_recorder(graph)
+        for run in self.sources if self.recorder is None else ():
+            run.without_recorder()
         self.shadow = Shadow(
             link,
             base=base,

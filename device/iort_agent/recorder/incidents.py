@@ -245,6 +245,8 @@ class Incidents:
                 return  # another window was merged into it just now
             # From here on none is.
             done = bool(incident.key) and path.exists()
+            if not done:
+                self._plan.follow(incident)
             incident.key = incident.key or "cutting"
             left = self._plan.left(incident, self._clock.now_us())
             free = self._max_bytes - self._waiting_bytes()
@@ -277,6 +279,7 @@ class Incidents:
                 _sync(self.folder)
         with self._plan.lock:
             self._plan.spend(incident, self._clock.now_us())
+            self._plan.note_cut(incident)
             self._held.pop(incident.id, None)
             self.alarm = None
             self._turn(incident, KEPT)
@@ -289,8 +292,9 @@ class Incidents:
         with self._plan.lock:
             incident.key = file_key(self._robot, file)
             incident.size, incident.messages, incident.missing = made.size, made.messages, made.missing
-            if _late(made):
-                incident.why = f"begins late{_late(made)}"
+            follows = f"follows {incident.follows}" if incident.follows else ""
+            late = f"begins late{_late(made)}" if _late(made) else ""
+            incident.why = "; ".join(filter(None, (follows, late)))
             if not self._plan.save():
                 raise OSError(self._plan.alarm)
 
