@@ -231,6 +231,7 @@ class Agent:
                 replayed=self._replayed,
                 agent=self._state,
                 graph=graph,
+                fires=bool(config.sources),
             )
         except AgentError as error:
             # A disk that fails costs the incidents, and neither samples nor stops.
