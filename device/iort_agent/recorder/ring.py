@@ -7,9 +7,8 @@
           attachments, lanes
 ```
 
-A killed process loses at most the last second, which was in memory. A power cut loses at most what was
-written since the last sync, every ``sync_s``: one for each chunk would cost an SD card many small writes to
-its journal.
+A killed process loses at most the last second, which was in memory, and a power cut what no closed chunk has:
+each is synced, unless ``sync_s`` spares a medium the writes to its journal.
 
 Times of the ring are microseconds that never jump: the wall clock when the agent began, or the end of the
 ring that it found if that is later, and from there on the monotonic clock. They are an MCAP's log times; its
