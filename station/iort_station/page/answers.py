@@ -39,7 +39,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     def minutes(request: Mapping[str, str]) -> int:
         return whole(request, "minutes", 1, 14 * 24 * 60)
 
-    counts = incidents.Counts(cloud)
+    counts, pictures = incidents.Counts(cloud), incidents.Pictures(cloud)
     return {
         "robots": lambda _request: {"robots": registry.presence(cloud)},
         "tags": lambda _request: {"tags": robots.tags(cloud)},
@@ -63,6 +63,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
         "notes": lambda request: insights.notes(cloud, request),
         "incidents": lambda request: incidents.incidents(cloud, request),
         "incident_counts": lambda _request: counts.answer(),
+        "incident_picture": pictures.answer,
         "motion": motion.fleet(cloud).motion,
         "socket": lambda _request: motion.address(cloud, VIEWER),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import threading
 import time
@@ -12,6 +13,7 @@ import pytest
 from iort_contract.messages.files import File, file_key
 from iort_contract.messages.recorder import KEPT, LOST, UPLOADED, Incident
 from iort_station.data import findings
+from iort_station.data.pictures import Line, Picture
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet.control import slept
 from iort_station.page import incidents as page
@@ -153,6 +155,38 @@ def test_an_uploaded_incident_is_downloaded_and_checked(lab, s3, tmp_path, monke
     monkeypatch.undo()
     with pytest.raises(StationError, match="not in the bucket any more"):
         download(asked, tmp_path)
+
+
+def test_a_picture_is_made_once_and_the_last_ones_are_kept(lab, s3, monkeypatch):
+    lab.bucket = s3
+    made = []
+
+    def make(_cloud, file):
+        made.append(file.key)
+        return Picture(b"jpeg", "/camera", 0.5) if len(made) == 1 else Picture(line=Line("x", [0.0], [1.0]))
+
+    pictures = page.Pictures(lab, make)
+    key = file_key("car", File("brake-1.mcap", "recording", "application/x-mcap", 8, "0" * 64, START))
+    s3.put_object(Bucket=FILES, Key=key, Body=CONTENT)
+    for number in (1, 2, 3):
+        lab.tell(incident(number, UPLOADED, key=key, bytes=8), START)
+    asked = [{"robot": "car", "id": f"{number:08x}", "from_us": str(START)} for number in (1, 2, 3)]
+    nothing = {"jpeg": "", "topic": "", "after_s": 0.0, "field": "", "times_s": [], "values": []}
+    first = {**nothing, "jpeg": base64.b64encode(b"jpeg").decode(), "topic": "/camera", "after_s": 0.5}
+    assert [pictures.answer(asked[0]) for _ in range(3)] == [first] * 3
+    assert made == [key]
+    assert pictures.answer(asked[1]) == {**nothing, "field": "x", "times_s": [0.0], "values": [1.0]}
+    # The one that nobody has asked for longest goes.
+    monkeypatch.setattr(page, "MOST_PICTURES", 2)
+    for each in (asked[0], asked[2], asked[0]):
+        pictures.answer(each)
+    assert len(made) == 3
+    pictures.answer(asked[1])
+    assert len(made) == 4
+    with pytest.raises(StationError, match="car has uploaded no incident 00000009"):
+        pictures.answer({**asked[0], "id": "00000009"})
+    with pytest.raises(StationError, match="van has uploaded no incident"):
+        pictures.answer({**asked[0], "robot": "van"})
 
 
 @pytest.mark.parametrize(
