@@ -20,7 +20,7 @@ from threading import Lock
 from typing import Iterable, Iterator, NamedTuple, Sequence, Tuple
 
 from iort_agent.errors import AgentError
-from iort_agent.recorder.ledger import Topic, fits
+from iort_agent.recorder.ledger import fits
 from iort_agent.recorder.segment import RingChannel, RingMessage, SegmentFile, read_segment
 
 _log = logging.getLogger(__name__)
@@ -30,6 +30,8 @@ FOLDER = "latched"
 SHARE, _MOST_FILES = 0.125, 64
 # Messages that wait for their file: of a topic, in bytes, and for how long.
 _TOGETHER, _TOGETHER_BYTES, _TOGETHER_US = 16, 1_000_000, 1_000_000
+# What is in force and waits in memory for a disk that is full.
+_MEMORY_BYTES = 16_000_000
 # The key of a channel's metadata that names the publisher.
 _PUBLISHER = "iort_publisher"
 # A topic's publisher: stream, topic, schema, publisher.
@@ -66,8 +68,8 @@ class LatchedFolder:
         except OSError as error:
             raise AgentError(f"recorder: {self._folder}: {error.strerror}") from error
         self._lock = Lock()
-        # By topic and stream: what waits for its file, and since when.
-        self._waiting: dict[Topic, list[tuple[str, RingMessage, bytes]]] = {}
+        # What waits for its file, by stream, topic and schema.
+        self._waiting: dict[tuple[str, ...], list[tuple[str, RingMessage, bytes]]] = {}
         self._known: list[_Known] = []
         self._sizes: dict[int, int] = {}
         # Messages that are too large, or did not find room on the disk.
@@ -81,11 +83,11 @@ class LatchedFolder:
         """Bytes on disk."""
         return sum(self._sizes.values())
 
-    def put(self, topic: Topic, message: RingMessage, publisher: str, *, again: bool) -> None:
+    def put(self, message: RingMessage, publisher: str, *, again: bool) -> None:
         """Take a message; one that came ``again`` is in force since before it came, if it is not known."""
-        digest = hashlib.blake2b(message.data, digest_size=8).digest()
+        digest = _digest(message.data)
         key = _key(message.channel, publisher)
-        waiting = self._waiting.setdefault(topic, [])
+        waiting = self._waiting.setdefault(key[:3], [])
         same = [one for one in self._known if one.key == key]
         digests = [one.digest for one in same] + [one[2] for one in waiting if one[0] == publisher]
         if digests and (digest in digests if again else digest == digests[-1]):
@@ -132,12 +134,25 @@ class LatchedFolder:
         return Latched(found, frozenset(one.key[1] for one in known))
 
     def give_way(self, now_us: int) -> None:
-        """Make room on a full disk: what is not in force any more goes first, then the rest."""
+        """Make room on a full disk: what is not in force any more goes first. The rest waits in memory for
+        the disk, as far as it is small."""
         before = self.size
         self._bound(now_us)
-        if self.size == before:
-            for file in [*self._sizes]:
-                self._delete(file)
+        if self.size < before or not before:
+            return
+        left = _MEMORY_BYTES
+        older: dict[tuple[str, ...], list[tuple[str, RingMessage, bytes]]] = {}
+        for publisher, message in self.in_force(2**62, None).messages:
+            left -= len(message.data)
+            if left >= 0:
+                kept = publisher, message, _digest(message.data)
+                older.setdefault(_key(message.channel, publisher)[:3], []).append(kept)
+            else:
+                self.dropped += 1
+        for file in [*self._sizes]:
+            self._delete(file)
+        for key, messages in older.items():
+            self._waiting[key] = messages + self._waiting.get(key, [])
 
     def _write(self, waiting: Sequence[tuple[str, RingMessage, bytes]]) -> SegmentFile:
         number = self._next
@@ -217,6 +232,10 @@ def _key(channel: RingChannel, publisher: str) -> _Key:
     return channel.stream, channel.topic, channel.schema, publisher
 
 
+def _digest(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=8).digest()
+
+
 def _too_many(sizes: Sequence[int]) -> bool:
     return len(sizes) > _TOGETHER or sum(sizes) > _TOGETHER_BYTES
 
@@ -243,5 +262,5 @@ def _read(path: Path, channels: dict[object, RingChannel]) -> Iterator[tuple[str
     for message in read_segment(path, 0, 2**62, channels):
         metadata = dict(message.channel.metadata)
         publisher = metadata.pop(_PUBLISHER, "")
-        digest = hashlib.blake2b(message.data, digest_size=8).digest()
+        digest = _digest(message.data)
         yield publisher, message._replace(channel=message.channel._replace(metadata=metadata)), digest

@@ -67,7 +67,7 @@ class RingWriter:
                 topic.channel = ros_channel(topic.stream, topic.kind, self._run)
         if latched_by is not None:
             message = RingMessage(topic.channel, max(0, seq), ring_us, t_us, payload)
-            self._latched.put(topic, message, latched_by, again=seq == AGAIN)
+            self._latched.put(message, latched_by, again=seq == AGAIN)
             if seq == AGAIN:
                 return
         if self._stopped:

@@ -262,7 +262,7 @@ def test_a_busy_topic_takes_a_bounded_part_of_the_ring(tmp_path: Path) -> None:
     desk.ring.close()
 
 
-def test_a_full_disk_takes_them_last_and_they_come_back(
+def test_a_full_disk_takes_their_files_last_and_they_come_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = Disk(10**12, 10**12)
@@ -277,10 +277,10 @@ def test_a_full_disk_takes_them_last_and_they_come_back(
     assert [message.data for _, message in desk.ring.latched(2**62).messages] == [new], "the past goes first"
     desk.pass_s(3)
     assert [*folder.iterdir()] == [], "the queue needs the room"
-    latest = latch(desk, 3)
+    static = latch(desk, 3, "", STATIC)
     disk.f_bavail = 10**12
     desk.pass_s(3)
-    assert [message.data for _, message in desk.ring.latched(2**62).messages] == [latest]
+    assert [message.data for _, message in desk.ring.latched(2**62).messages] == [new, static]
     desk.ring.close()
 
 
