@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import re
 
+import pytest
+
 from testkit.waiting import until
 from tests.browser import drawn, show
 from tests.images import jpeg
@@ -67,16 +69,6 @@ def test_an_uploaded_incident_has_a_picture_that_says_what_it_shows(open_page, l
     assert items(page, "car").get_by_role("img").count() == 1
     # The edge is a line at its time: in the middle of four seconds.
     assert float(line.locator(".edge").get_attribute("x1")) == 80
-    # A list that has changed asks no more for what is known.
-    lab.incidents = [incident(0, "uploaded", bytes=5, messages=1, trigger="take"), *lab.incidents]
-    lab.shown = {**lab.shown, "field": "", "times_s": [], "values": []}
-    page.reload()
-    show(page, car.send())
-    seen(page)
-    until(lambda: sorted(set(lab.pictures)) == [f"{0:016x}", f"{1:016x}"], "both pictures")
-    # What has nothing to show has no picture, and the list is as it was.
-    until(lambda: items(page, "car").locator(".incident-picture").count() == 0, "no pictures")
-    assert items(page, "car").count() == 4
 
 
 def test_the_picture_of_a_camera_is_its_image_at_the_edge(open_page, lab, server, car):
@@ -89,19 +81,23 @@ def test_the_picture_of_a_camera_is_its_image_at_the_edge(open_page, lab, server
     assert image.get_attribute("aria-label").endswith(": /camera/front, 34 ms before the edge")
     assert image.evaluate("(canvas) => [canvas.width, canvas.height]") == [160, 120]
     assert page.get_by_text("/camera/front", exact=True).is_visible()
-    # What is no small JPEG is not decoded.
-    lab.shown = {**about, "jpeg": base64.b64encode(jpeg(width=300, height=20)).decode()}
-    page.reload()
+
+
+@pytest.mark.parametrize(
+    ("shown", "refuses"),
+    [
+        (NO_PICTURE, False),
+        # What is no small JPEG is not decoded.
+        ({**NO_PICTURE, "jpeg": base64.b64encode(jpeg(width=300, height=20)).decode()}, False),
+        (NO_PICTURE, True),
+    ],
+)
+def test_what_has_no_picture_leaves_the_list_as_it_is(open_page, lab, server, car, shown, refuses):
+    lab.shown, lab.refuses = shown, refuses
+    page = open_page(server.url + "#/car/car-1")
     show(page, car.send())
     seen(page)
-    until(lambda: len(lab.pictures) == 2, "the question")
-    until(lambda: items(page, "car").locator(".incident-picture").count() == 0, "no picture")
-    # Nor does a failure to make it touch the list.
-    lab.refuses, lab.pictures = True, []
-    page.reload()
-    show(page, car.send())
-    seen(page)
-    until(lambda: len(lab.pictures) == 1, "the question")
+    until(lambda: lab.pictures, "the question")
     until(lambda: items(page, "car").locator(".incident-picture").count() == 0, "no picture")
     assert items(page, "car").count() == 3
 
