@@ -78,13 +78,13 @@ def test_the_picture_of_a_camera_is_its_image_at_the_edge(open_page, lab, server
     page = open_page(server.url + "#/car/car-1", timezone_id="UTC")
     show(page, car.send())
     image = pictured(page)
-    assert image.get_attribute("aria-label").endswith(": /camera/front, 34 ms before the edge")
+    assert image.get_attribute("aria-label").endswith(": /camera/front, 0.03 s before the edge")
     assert image.evaluate("(canvas) => [canvas.width, canvas.height]") == [160, 120]
     assert page.get_by_text("/camera/front", exact=True).is_visible()
 
 
 @pytest.mark.parametrize(
-    ("shown", "refuses"),
+    "answer",
     [
         (NO_PICTURE, False),
         # What is no small JPEG is not decoded.
@@ -92,8 +92,8 @@ def test_the_picture_of_a_camera_is_its_image_at_the_edge(open_page, lab, server
         (NO_PICTURE, True),
     ],
 )
-def test_what_has_no_picture_leaves_the_list_as_it_is(open_page, lab, server, car, shown, refuses):
-    lab.shown, lab.refuses = shown, refuses
+def test_what_has_no_picture_leaves_the_list_as_it_is(open_page, lab, server, car, answer):
+    lab.shown, lab.refuses = answer
     page = open_page(server.url + "#/car/car-1")
     show(page, car.send())
     seen(page)

@@ -3,7 +3,7 @@
 
 import type { IncidentPicture } from "../base/contract";
 import { el } from "../base/dom";
-import { age, number } from "../base/format";
+import { number } from "../base/format";
 import { ask } from "../server/answers";
 import { bitmapOf, draw } from "./thumbnail";
 
@@ -69,7 +69,7 @@ async function show(node: HTMLElement, picture: IncidentPicture, label: string):
   const { jpeg, topic, after_s, field, times_s, values } = picture;
   const bitmap = jpeg ? await bitmapOf(jpeg) : undefined;
   if (bitmap) {
-    const when = `${age(Math.abs(after_s))} ${after_s < 0 ? "before" : "after"}`;
+    const when = `${Math.abs(after_s).toFixed(2)} s ${after_s < 0 ? "before" : "after"}`;
     const canvas = el("canvas", { role: "img", "aria-label": `${label}: ${topic}, ${when} the edge` });
     draw(canvas, bitmap);
     node.replaceChildren(canvas, el("figcaption", { "aria-hidden": "true", title: topic }, topic));
