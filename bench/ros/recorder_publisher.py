@@ -26,6 +26,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from testkit.publishing import Deadlines, ready, say
+
 # Topic -> type and rate.
 SMALL, LARGE = "geometry_msgs/PointStamped", "sensor_msgs/Image"
 TOPICS = {"/small": (SMALL, 1000), "/large": (LARGE, 30), "/demand": (SMALL, 20)}
@@ -165,23 +167,19 @@ def main() -> None:
 
         if options.latched:
             publish(LATCHED)
-        while min(subscribers() for _, subscribers in topics.values()) < options.subscribers:
-            time.sleep(0.05)
-        print("ready", flush=True)
+        ready(lambda: min(subscribers() for _, subscribers in topics.values()), options.subscribers)
         threading.Thread(target=orders.listen, daemon=True).start()
-        began = time.monotonic()
+        deadlines = Deadlines()
         while not orders.stop.is_set():
             if options.latched and sent[LATCHED] <= orders.latched:
                 publish(LATCHED)
             topic = min(TOPICS, key=lambda one: sent[one] / TOPICS[one][1])
-            ahead_s = began + sent[topic] / TOPICS[topic][1] - time.monotonic()
-            if ahead_s > 0:
-                time.sleep(ahead_s)
+            deadlines.wait(sent[topic] / TOPICS[topic][1])
             publish(topic)
     # What was published last is on its way.
     time.sleep(1)
     end()
-    print(sum(sent.values()), flush=True)
+    say(f"{sum(sent.values())}")
 
 
 main()
