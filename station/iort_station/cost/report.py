@@ -1,5 +1,5 @@
 """The cost model's tables as rows of text, for the command, the README and the bench; with them what a fleet
-needs of AWS' default quotas, and a deployment's own month, whoever drives. Pure."""
+needs of AWS' default quotas, a deployment's own month, whoever drives, and what incidents cost. Pure."""
 
 from __future__ import annotations
 
