@@ -29,8 +29,8 @@ from iort_agent.recorder.latched import Latched
 from iort_agent.recorder.ledger import fits
 from iort_agent.recorder.plan import Incident
 from iort_agent.recorder.ring import Drop, RingChannel, RingMessage
+from iort_contract.messages.recorder import ABOUT_RECORD, ACCOUNT_RECORD
 
-INCIDENT, ACCOUNT = "iort.incident", "iort.account"
 PART = ".part"
 # A message's own time may be so much off the time at which it came, and it is looked for.
 SLACK_US = 1_000_000
@@ -161,8 +161,8 @@ def cut(
         lost = losses.between(incident.ring_from_us, incident.ring_to_us)
         topics = account.close(drops, lost, partial(fits, incident.topics or ["*"]))
         account.late_us = max(0, ring.since_us() - incident.ring_from_us)
-        writer.add_metadata(INCIDENT, _about(incident, account, losses))
-        writer.add_metadata(ACCOUNT, {topic: json.dumps(counts) for topic, counts in topics.items()})
+        writer.add_metadata(ABOUT_RECORD, _about(incident, account, losses))
+        writer.add_metadata(ACCOUNT_RECORD, {topic: json.dumps(counts) for topic, counts in topics.items()})
         writer.finish()
         file.flush()
         os.fsync(file.fileno())

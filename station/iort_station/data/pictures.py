@@ -26,6 +26,7 @@ from iort_contract.catalog.derived import SOURCES
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.expression import ExpressionError
 from iort_contract.limits import ContractError, MessageError
+from iort_contract.messages.recorder import ABOUT_RECORD, CHANNEL_STREAM
 from iort_contract.ros.decode import Decoder
 from iort_contract.ros.definition import parse
 from iort_contract.triggers import parse_trigger
@@ -80,7 +81,7 @@ def picture(cloud: Cloud, file: StoredFile) -> Picture:
         if summary is None:
             return Picture()
         named = {one.name: one.metadata for one in reader.iter_metadata()}
-        about = named.get("iort.incident", {})
+        about = named.get(ABOUT_RECORD, {})
         content.most += _MOST_BYTES
         incident = _Incident(content, summary.chunk_indexes, _edge_ns(about))
         channels = [
@@ -340,7 +341,7 @@ def _line(
 
 
 def _stream(channel: Channel) -> str:
-    return str(channel.metadata.get("stream", channel.topic))
+    return str(channel.metadata.get(CHANNEL_STREAM, channel.topic))
 
 
 def _fields(about: Mapping[str, str]) -> Iterator[tuple[str, str]]:

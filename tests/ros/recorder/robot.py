@@ -25,7 +25,7 @@ NODES = Path(__file__).resolve().parents[1] / "nodes"
 TOPICS = ("/small", "/large", "/demand", LATCHED)
 # The demands that fire.
 ONE, OTHER, OFTEN = 1, 2, 3
-DISK_MB = 400
+DISK_MB = 1000
 WAIT_S = 300.0
 _MEGABYTE = bytes(1_000_000)
 
@@ -64,7 +64,7 @@ class Robot:
             "files": {"rate_kb_s": 0},
             "sources": [{"type": f"ros{graph.ros}", "topics": topics}],
             "recorder": {
-                "folder": str(self.ring), "keep_free_mb": 0, "max_mb": 150, "max_disk_share": 0.5,
+                "folder": str(self.ring), "keep_free_mb": 0, "max_mb": 400, "max_disk_share": 0.5,
                 "topics": list(TOPICS),
             },
         }  # fmt: skip

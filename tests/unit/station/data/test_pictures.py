@@ -15,6 +15,7 @@ from PIL import Image
 from rosbags.typesys import Stores, get_typestore
 
 from iort_contract.messages.files import File, file_key
+from iort_contract.messages.recorder import CHANNEL_STREAM
 from iort_station.data import pictures
 from iort_station.data.pictures import SIDE, Picture, picture
 from iort_station.fleet import files
@@ -53,7 +54,7 @@ def vesc(writer, **fields):
     """Half a minute of the serial VESC: JSON, whose current jumps at the edge."""
     schema = {"properties": {name: {} for name in ("current_input", "speed", "state", *fields)}}
     schema_id = writer.register_schema("iort.vesc", "jsonschema", json.dumps(schema).encode())
-    channel = writer.register_channel("vesc", "json", schema_id, {"stream": "vesc"})
+    channel = writer.register_channel("vesc", "json", schema_id, {CHANNEL_STREAM: "vesc"})
     for i in range(2000):
         at = (RING_US + i * 20_000) * US
         values = {"current_input": -20.0 if i >= 1500 else 3.0, "speed": 5000.0, "state": "ok", **fields}
@@ -66,7 +67,7 @@ def topic(writer, ros, kind, name="/camera"):
     named = kind if ros2 else kind.replace("/msg", "")
     text = store.generate_msgdef(kind, ros_version=2 if ros2 else 1)[0]
     schema = writer.register_schema(named, "ros2msg" if ros2 else "ros1msg", text.encode())
-    channel = writer.register_channel(name, "cdr" if ros2 else "ros1", schema, {"stream": "camera"})
+    channel = writer.register_channel(name, "cdr" if ros2 else "ros1", schema, {CHANNEL_STREAM: "camera"})
     types = store.types
     stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=0)
     sequence = {} if ros2 else {"seq": 0}
