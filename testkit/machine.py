@@ -6,7 +6,7 @@ import os
 import platform
 import re
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -125,6 +125,20 @@ def threads_of(pid: int) -> dict[str, Threads]:
         before = found.get(name.strip(), Threads())
         found[name.strip()] = Threads(before.cpu_s + cpu_s, before.waits + waits)
     return found
+
+
+def spent(
+    before: Mapping[str, Threads], after: Mapping[str, Threads], seconds: float, messages: float
+) -> dict[str, tuple[float, float]]:
+    """Return, of each thread by its name, the us a message and the wake-ups a second between two readings."""
+    none = Threads()
+    return {
+        name: (
+            (now.cpu_s - before.get(name, none).cpu_s) / messages * 1e6,
+            (now.waits - before.get(name, none).waits) / seconds,
+        )
+        for name, now in after.items()
+    }
 
 
 def spent_ms(before: dict[int, int], after: dict[int, int]) -> float:

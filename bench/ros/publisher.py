@@ -6,10 +6,9 @@ Waits for the subscribers of each of its topics, then for a line on its input. P
 rate, or at RATE_HZ, with time stamps of now. At the end it prints the number of messages by topic, as JSON.
 """
 
-import heapq
 import json
+import math
 import sys
-import threading
 import time
 from typing import Any
 
@@ -17,16 +16,17 @@ import genpy.dynamic
 import rospy
 
 from bench.ros.mixed_robot import HEADER, NODES, Topic
+from testkit.publishing import publish_in_turn, ready, say
 
 # Messages that a subscriber's connection may hold: a second of the fastest topic.
 _QUEUE = 1000
 
 
 class Line:
-    """One topic, with its publisher and its next message."""
+    """One topic, with its publisher and its next message. Without a rate it is published once."""
 
     def __init__(self, topic: Topic, rate_hz: float) -> None:
-        self.topic, self.rate_hz, self.sent = topic, rate_hz, 0
+        self.topic, self.rate_hz, self.sent, self.due_s = topic, rate_hz, 0, 0.0
         self._classes: Any = genpy.dynamic.generate_dynamic(topic.kind, topic.definition)
         self._message = self._classes[topic.kind]()
         self.publisher = rospy.Publisher(
@@ -40,6 +40,7 @@ class Line:
             self._message.header.frame_id = self.topic.frame
         self.publisher.publish(self._message)
         self.sent += 1
+        self.due_s = self.sent / self.rate_hz if self.rate_hz else math.inf
 
 
 def main() -> None:
@@ -48,24 +49,10 @@ def main() -> None:
     rospy.init_node(node, disable_signals=True)
     rate_hz = float(sys.argv[4]) if len(sys.argv) > 4 else None
     lines = [Line(topic, topic.rate_hz if rate_hz is None else rate_hz) for topic in NODES[node]]
-    pause = threading.Event()
-    while any(line.publisher.get_num_connections() < subscribers for line in lines):
-        pause.wait(0.01)
-    print("ready", flush=True)
+    ready(lambda: min(line.publisher.get_num_connections() for line in lines), subscribers)
     sys.stdin.readline()
-    began = time.monotonic()
-    # When which line is next.
-    due = [(0.0, i) for i in range(len(lines))]
-    while due:
-        at_s, i = heapq.heappop(due)
-        line = lines[i]
-        ahead_s = began + at_s - time.monotonic()
-        if ahead_s > 0:
-            pause.wait(ahead_s)
-        line.publish()
-        if line.rate_hz and line.sent / line.rate_hz < seconds:
-            heapq.heappush(due, (line.sent / line.rate_hz, i))
-    print(json.dumps({line.topic.name: line.sent for line in lines}), flush=True)
+    publish_in_turn(lines, seconds)
+    say(json.dumps({line.topic.name: line.sent for line in lines}))
     sys.stdin.readline()
 
 

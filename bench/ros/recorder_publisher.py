@@ -1,12 +1,14 @@
 """The publisher of the event recorder's proof and bench; runs under a Python with the ROS.
 
-    python -m bench.ros.recorder_publisher NAME FOLDER [--ros2] [--subscribers 1]
+    python -m bench.ros.recorder_publisher NAME FOLDER [--ros2] [--subscribers 1] [--latched]
 
-It publishes 1,000 small messages, 30 of 100 KB and 20 demands a second. Each has a stamp and a number of its
-own. It prints ``ready`` when every topic has its subscribers and begins; FOLDER/NAME.sent has a line for each
-message: topic, number, time, stamp, subscribers, SHA-256. Lines on its input:
+It publishes 1,000 small messages, 30 of 100 KB and 20 demands a second, and with ``--latched`` one latched
+message before anybody listens. Each has a stamp and a number of its own. It prints ``ready`` when every topic
+has its subscribers and begins; FOLDER/NAME.sent has a line for each message: topic, number, time, stamp,
+subscribers, SHA-256. Lines on its input:
 
 - ``demand 3``: the next four demands are 3
+- ``latch``: publish another latched message
 - ``back 120``: stamps are so many seconds earlier from now on
 - ``quit``: end
 """
@@ -20,13 +22,16 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+
+from testkit.publishing import Deadlines, ready, say
 
 # Topic -> type and rate.
 SMALL, LARGE = "geometry_msgs/PointStamped", "sensor_msgs/Image"
 TOPICS = {"/small": (SMALL, 1000), "/large": (LARGE, 30), "/demand": (SMALL, 20)}
+LATCHED = "/static"
 LARGE_BYTES = 100_000
 _DEMANDS = 4
 _noise = os.urandom(2 * LARGE_BYTES)
@@ -34,13 +39,14 @@ _noise = os.urandom(2 * LARGE_BYTES)
 Publish = Callable[[int, int, float], bytes]
 # Topic -> what publishes, and what counts the subscribers.
 Topics = dict[str, tuple[Publish, Callable[[], int]]]
+Rates = Mapping[str, tuple[str, int]]
 
 
 def _data(n: int) -> bytes:
     return _noise[n % LARGE_BYTES :][:LARGE_BYTES]
 
 
-def _ros1(name: str) -> tuple[Topics, Callable[[], object]]:
+def _ros1(name: str, rates: Rates) -> tuple[Topics, Callable[[], object]]:
     """The topics, and what ends them."""
     import rospy  # noqa: PLC0415 - only one of the two is there
 
@@ -51,7 +57,8 @@ def _ros1(name: str) -> tuple[Topics, Callable[[], object]]:
         names = {"_type": kind, "_md5sum": told.md5sum, "_full_text": told.definition}
         # A message that consists of its bytes.
         of_bytes: Any = type("Bytes", (rospy.AnyMsg,), names)
-        made = rospy.Publisher(topic, of_bytes, queue_size=2 * rate_hz, tcp_nodelay=True)
+        size, latch = max(1, 2 * rate_hz), topic == LATCHED
+        made = rospy.Publisher(topic, of_bytes, queue_size=size, tcp_nodelay=True, latch=latch)
 
         def publish(n: int, stamp_us: int, demand: float) -> bytes:
             if kind == SMALL:
@@ -68,13 +75,14 @@ def _ros1(name: str) -> tuple[Topics, Callable[[], object]]:
         return publish, made.get_num_connections
 
     rospy.init_node(name, disable_signals=True, disable_rosout=True)
-    topics = {one: topic(one, kind, rate_hz) for one, (kind, rate_hz) in TOPICS.items()}
+    topics = {one: topic(one, kind, rate_hz) for one, (kind, rate_hz) in rates.items()}
     return topics, lambda: rospy.signal_shutdown("done")
 
 
-def _ros2(name: str) -> tuple[Topics, Callable[[], object]]:
+def _ros2(name: str, rates: Rates) -> tuple[Topics, Callable[[], object]]:
     """As `_ros1`."""
     import rclpy  # noqa: PLC0415 - only one of the two is there
+    from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: PLC0415 - as above
     from rclpy.serialization import serialize_message  # noqa: PLC0415 - as above
     from rosidl_runtime_py.utilities import get_message  # noqa: PLC0415 - as above
 
@@ -83,7 +91,10 @@ def _ros2(name: str) -> tuple[Topics, Callable[[], object]]:
 
     def topic(topic: str, kind: str, rate_hz: int) -> tuple[Publish, Callable[[], int]]:
         made_of: Any = get_message(kind.replace("/", "/msg/"))
-        made, message = node.create_publisher(made_of, topic, 2 * rate_hz), made_of()
+        qos = QoSProfile(depth=max(1, 2 * rate_hz))
+        if topic == LATCHED:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        made, message = node.create_publisher(made_of, topic, qos), made_of()
 
         def publish(n: int, stamp_us: int, demand: float) -> bytes:
             stamp = message.header.stamp
@@ -99,7 +110,7 @@ def _ros2(name: str) -> tuple[Topics, Callable[[], object]]:
 
         return publish, made.get_subscription_count
 
-    return {one: topic(one, kind, rate_hz) for one, (kind, rate_hz) in TOPICS.items()}, rclpy.shutdown
+    return {one: topic(one, kind, rate_hz) for one, (kind, rate_hz) in rates.items()}, rclpy.shutdown
 
 
 class _Orders:
@@ -107,7 +118,7 @@ class _Orders:
 
     def __init__(self) -> None:
         self.stop = threading.Event()
-        self.back_us = 0
+        self.back_us = self.latched = 0
         self._demand, self._left = 0.0, 0
 
     def listen(self) -> None:
@@ -116,6 +127,8 @@ class _Orders:
             word, _, number = line.strip().partition(" ")
             if word == "demand":
                 self._demand, self._left = float(number), _DEMANDS
+            elif word == "latch":
+                self.latched += 1
             elif word == "back":
                 self.back_us = int(number) * 1_000_000
             else:
@@ -135,20 +148,15 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--ros2", action="store_true")
     parser.add_argument("--subscribers", type=int, default=1)
+    parser.add_argument("--latched", action="store_true")
     options = parser.parse_args()
-    topics, end = (_ros2 if options.ros2 else _ros1)(options.name)
-    while min(subscribers() for _, subscribers in topics.values()) < options.subscribers:
-        time.sleep(0.05)
-    print("ready", flush=True)
+    rates: Rates = {**TOPICS, LATCHED: (SMALL, 0)} if options.latched else TOPICS
+    topics, end = (_ros2 if options.ros2 else _ros1)(options.name, rates)
     orders = _Orders()
-    threading.Thread(target=orders.listen, daemon=True).start()
-    began, sent = time.monotonic(), dict.fromkeys(topics, 0)
+    sent = dict.fromkeys(topics, 0)
     with (options.folder / f"{options.name}.sent").open("w") as record:
-        while not orders.stop.is_set():
-            topic = min(sent, key=lambda one: sent[one] / TOPICS[one][1])
-            ahead_s = began + sent[topic] / TOPICS[topic][1] - time.monotonic()
-            if ahead_s > 0:
-                time.sleep(ahead_s)
+
+        def publish(topic: str) -> None:
             publish, subscribers = topics[topic]
             n, count, now_us = sent[topic], subscribers(), time.time_ns() // 1000
             stamp_us = now_us - orders.back_us
@@ -156,10 +164,22 @@ def main() -> None:
             digest = hashlib.sha256(publish(n, stamp_us, demand)).hexdigest()
             record.write(f"{topic} {n} {now_us} {stamp_us} {count} {digest}\n")
             sent[topic] = n + 1
+
+        if options.latched:
+            publish(LATCHED)
+        ready(lambda: min(subscribers() for _, subscribers in topics.values()), options.subscribers)
+        threading.Thread(target=orders.listen, daemon=True).start()
+        deadlines = Deadlines()
+        while not orders.stop.is_set():
+            if options.latched and sent[LATCHED] <= orders.latched:
+                publish(LATCHED)
+            topic = min(TOPICS, key=lambda one: sent[one] / TOPICS[one][1])
+            deadlines.wait(sent[topic] / TOPICS[topic][1])
+            publish(topic)
     # What was published last is on its way.
     time.sleep(1)
     end()
-    print(sum(sent.values()), flush=True)
+    say(f"{sum(sent.values())}")
 
 
 main()

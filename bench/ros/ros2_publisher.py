@@ -10,7 +10,6 @@ line. It publishes bytes, as making a message of Python's objects would take mos
 import math
 import struct
 import sys
-import threading
 import time
 from typing import Any
 
@@ -20,6 +19,7 @@ from rclpy.serialization import serialize_message
 from rosidl_runtime_py.utilities import get_message
 
 from bench.ros.ros2_loads import LARGE, LOADS
+from testkit.publishing import Deadlines, ready, say
 
 # A second of the fastest topic, and more.
 _DEPTH = 2000
@@ -52,24 +52,21 @@ def main() -> None:
     node = rclpy.create_node("bench_publisher")
     qos = QoSProfile(depth=_DEPTH)
     publishers = [node.create_publisher(get_message(load.kind), topic, qos) for topic in load.topics]
-    prepared, pause = bodies(load.kind), threading.Event()
-    give_up = time.monotonic() + _JOIN_S
-    while any(publisher.get_subscription_count() < subscribers for publisher in publishers):
-        if time.monotonic() > give_up:
-            sys.exit(f"no {subscribers} subscribers of every topic within {_JOIN_S} s")
-        pause.wait(0.05)
-    print("ready", flush=True)
+    prepared = bodies(load.kind)
+    ready(
+        lambda: min(publisher.get_subscription_count() for publisher in publishers),
+        subscribers,
+        within_s=_JOIN_S,
+    )
     sys.stdin.readline()
-    began, at_once = time.monotonic(), len(publishers) if load.together else 1
+    deadlines, at_once = Deadlines(), len(publishers) if load.together else 1
     every_s = at_once / (load.rate_hz * len(publishers))
     for n in range(messages * len(publishers)):
-        ahead_s = began + n // at_once * every_s - time.monotonic()
-        if ahead_s > 0:
-            time.sleep(ahead_s)
+        deadlines.wait(n // at_once * every_s)
         body = prepared[n % _BODIES]
         struct.pack_into("<iI", body, 4, *divmod(time.time_ns(), 1_000_000_000))
         publishers[n % len(publishers)].publish(bytes(body))
-    print(messages * len(publishers), flush=True)
+    say(f"{messages * len(publishers)}")
     sys.stdin.readline()
     node.destroy_node()
     rclpy.shutdown()

@@ -88,7 +88,6 @@ RATES_HZ = (50, 1000)
 CPU_TIMES = {50: 2.5, 1000: 1.5}
 LIVE_TIMES, REST_PERCENT, RSS_MB = 2.0, 0.3, 80.0
 _CATCH_UP_S = 30.0
-_NONE = machine.Threads()
 
 
 @dataclass(frozen=True)
@@ -176,13 +175,7 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
         agent.terminate()
         agent.wait()
     ours, floors = (
-        {
-            name: (
-                (now.cpu_s - then.get(name, _NONE).cpu_s) / (took_s * rate_hz) * 1e6,
-                (now.waits - then.get(name, _NONE).waits) / took_s,
-            )
-            for name, now in threads.items()
-        }
+        machine.spent(then, threads, took_s, took_s * rate_hz)
         for then, threads in zip(before, after, strict=True)
     )
     agent_us, floor_us = (sum(us for us, _ in threads.values()) for threads in (ours, floors))

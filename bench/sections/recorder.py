@@ -3,7 +3,8 @@ beside `rosbag record` or `ros2 bag record` of the same topics.
 
 All of these subscribe at the same time: an agent with the ring, one without that takes only what is recorded,
 and ROS' recorder. Both agents publish the live lane to mosquitto, so that its delays are of the same moments.
-In the middle a trigger fires: its incident is what would be uploaded.
+Then a trigger fires. Its incident is what would be uploaded, and what it costs is told apart: ROS' recorders
+cut nothing.
 
 Without ROS or mosquitto the section has no figures and says why.
 """
@@ -44,6 +45,8 @@ from testkit.waiting import InstrumentError, reached
 # The most: as a multiple of what ROS' recorder takes.
 TIMES = 1.2
 WITH, WITHOUT, RECORDER = "agent with the ring", "agent without", "ROS' recorder"
+# The agent's thread that cuts incidents.
+_CUTS = "incidents"
 _STREAM, _RING_TOPICS = "demand", ("/small", "/large")
 _BEFORE_S, _AFTER_S, _DEMAND = 3.0, 2.0, 1
 _START_S, _WARM_UP_S, _END_S = 90.0, 4.0, 60.0
@@ -52,7 +55,8 @@ _START_S, _WARM_UP_S, _END_S = 90.0, 4.0, 60.0
 @dataclass(frozen=True)
 class Run:
     """What a drive of ``seconds`` took, by subscriber: share of a core, bytes written, ms of the live lane.
-    ``published`` are its messages, and ``incident`` are the bytes of an incident of five seconds."""
+    ``published`` are its messages, ``incident`` the bytes of an incident of five seconds, and ``incident_s``
+    the processor's seconds that it took."""
 
     recorder: str
     seconds: float
@@ -62,6 +66,7 @@ class Run:
     live: dict[str, Spread]
     dropped: int
     incident: int
+    incident_s: float
 
 
 def run(_target: Target | None, say: Say, *, seconds: int) -> Section:
@@ -186,17 +191,19 @@ def _measure(program: str, ros2: Ros2 | None, seconds: int) -> Run:
         status = _status(cars[WITH])
         warm = {who: len(found) for who, found in delays.items()}
         written, before, began = _written(status, folder), _used(processes), time.monotonic()
-        pause.wait(seconds / 2)
-        _say(publisher, f"demand {_DEMAND}")
-        pause.wait(seconds / 2)
+        pause.wait(seconds)
         after, took_s = _used(processes), time.monotonic() - began
         status = _status(cars[WITH])
         now_written = _written(status, folder)
-        _say(publisher, "quit")
-        published = int(_line(publisher))
+        live = {who: Spread.of(found[warm[who] :]) for who, found in delays.items()}
+        cutting = machine.threads_of(processes[WITH].pid)[_CUTS]
+        _say(publisher, f"demand {_DEMAND}")
         incidents = cars[WITH].parent / "ring" / "incidents"
         if not reached(lambda: bool(list(incidents.glob("*.mcap"))), within_s=_END_S):
             raise InstrumentError("no incident was cut")
+        incident_s = machine.threads_of(processes[WITH].pid)[_CUTS].cpu_s - cutting.cpu_s
+        _say(publisher, "quit")
+        published = int(_line(publisher))
         incident = sum(path.stat().st_size for path in incidents.glob("*.mcap"))
         for who, process in processes.items():
             process.send_signal(signal.SIGINT if who == RECORDER else signal.SIGTERM)
@@ -208,9 +215,10 @@ def _measure(program: str, ros2: Ros2 | None, seconds: int) -> Run:
         published,
         {who: (usage.cpu_s - before[who].cpu_s) / took_s for who, usage in after.items()},
         {who: size - written[who] for who, size in now_written.items()},
-        {who: Spread.of(found[warm[who] :]) for who, found in delays.items()},
+        live,
         sum(status["recorder"]["ring"]["dropped"].values()),
         incident,
+        incident_s,
     )
 
 
@@ -268,7 +276,6 @@ def report(section: Section, runs: list[Run]) -> None:
         live = [one.live[who].text(2) if who in one.live else "-" for who in order]
         rows.append([f"live lane, beside {one.recorder}", *live])
         if RECORDER in one.core:
-            # What the ring alone costs: both agents record the same beside.
             section.ratio(
                 f"processor of the agent with the ring / {one.recorder}'s",
                 one.core[WITH] / one.core[RECORDER], TIMES, tolerance=2,
@@ -287,7 +294,13 @@ def report(section: Section, runs: list[Run]) -> None:
                 unit="ms",
                 tolerance=3,
             )
-        everything = one.written[WITH] / one.seconds * (_BEFORE_S + _AFTER_S)
+        of_s = _BEFORE_S + _AFTER_S
+        everything = one.written[WITH] / one.seconds * of_s
+        section.ratio(
+            f"processor of an incident / the agent's of its {of_s:g} s, beside {one.recorder}",
+            one.incident_s / (one.core[WITH] * of_s),
+            None,
+        )
         section.ratio(
             f"messages that the ring dropped, beside {one.recorder}", one.dropped, 0, unit="messages"
         )

@@ -155,16 +155,7 @@ def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int, *,
         source = json.loads(written.read_text())["sources"][0]
         counted[AGENT] = _arrived(heard, streams)
     messages = took_s * load.rate_hz * len(load.topics)
-    spent = {
-        who: {
-            thread: (
-                (now.cpu_s - before[who].get(thread, _NONE).cpu_s) / messages * 1e6,
-                (now.waits - before[who].get(thread, _NONE).waits) / took_s,
-            )
-            for thread, now in threads.items()
-        }
-        for who, threads in after.items()
-    }
+    spent = {who: machine.spent(before[who], threads, took_s, messages) for who, threads in after.items()}
     return Run(
         middleware,
         name,

@@ -124,6 +124,8 @@ class Agent:
         # Why the recorder does not work, although the configuration has one.
         self.no_recorder: str | None = None
         self.recorder = self._make_recorder(graph)
+        for run in self.sources if self.recorder is None else ():
+            run.without_recorder()
         self.shadow = Shadow(
             link,
             base=base,
@@ -229,6 +231,7 @@ class Agent:
                 replayed=self._replayed,
                 agent=self._state,
                 graph=graph,
+                fires=bool(config.sources),
             )
         except AgentError as error:
             # A disk that fails costs the incidents, and neither samples nor stops.

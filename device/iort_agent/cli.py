@@ -103,7 +103,7 @@ def command_line() -> argparse.ArgumentParser:
         "(default: as long as it takes, or 10 after a signal)",
     )
     running.add_argument("--log-level", choices=LOG_LEVELS, help="instead of the file's log_level")
-    flushing = command("flush", flush, "deliver what the queue still holds, and record nothing")
+    flushing = command("flush", flush, "deliver what the queue and the recorder hold, and record nothing")
     flushing.add_argument("--drain-s", type=_seconds, metavar="S", help="give up after this time")
     checking = command("check", check, "check everything that the file names, and say what to do")
     checking.add_argument("--json", action="store_true", help="as JSON")

@@ -108,11 +108,12 @@ def load_config(file: Path) -> Config:
 
 
 def without_sources(config: Config) -> Config:
-    """The configuration of a run that only delivers what the runs before it have left."""
+    """The configuration of a run that only delivers what the runs before it have left, incidents too."""
+    recorder = config.recorder
     return replace(
         config,
         sources=(),
-        recorder=None,
+        recorder=None if recorder is None else replace(recorder, service=None, topic=None),
         share=(),
         downlink=DownlinkConfig(),
         ping=PingConfig(),

@@ -100,13 +100,14 @@ class Runtime:
         agent.pings.wake()
         for thread in (*sources, ticker, pinger):
             thread.join()
+        uploaded = bool(sources) or self._end_incidents(drain_s)
         if agent.recorder is not None:
             agent.recorder.close()
         agent.pings.close(_LAST_PONGS_S if drain_s is None else min(_LAST_PONGS_S, drain_s))
         agent.streams.flush()
         self._check_sources()
         self._send_log()
-        delivered = self._drain(drain_s, stopped=stopped)
+        delivered = self._drain(drain_s, stopped=stopped) and uploaded
         if agent.downlink is not None:
             agent.downlink.close(keep_stop=not self._asked)
         delivered = self._end_uploads(uploader, uploads_stop, drain_s, stopped=stopped) and delivered
@@ -245,6 +246,21 @@ class Runtime:
             if waited - logged >= self._progress_s:
                 logged = waited
                 tell()
+
+    def _end_incidents(self, drain_s: float | None) -> bool:
+        """Upload what earlier runs have kept of events; whether nothing is left."""
+        recorder = self.agent.recorder
+        if recorder is None:
+            return self.agent.no_recorder is None
+
+        def tell(log: Callable[..., None] = _log.info) -> None:
+            left = recorder.incidents.waiting()
+            log("%d incidents are still to be cut, and %d to be uploaded", left["open"], left["waiting"])
+
+        if self._wait(recorder.incidents.wait_empty, drain_s, tell):
+            return True
+        tell(_log.error)
+        return False
 
     def _tell_left(self) -> None:
         left, connection = self.agent.spool.backlog(), self.agent.uplink.status()

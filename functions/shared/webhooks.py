@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import http.client
 import logging
+import socket
 import ssl
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as LateError
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -17,11 +22,10 @@ from iort_contract.limits import ContractError
 from iort_contract.webhook import Webhook, headers, stored_webhook
 
 _log = logging.getLogger(__name__)
-# Of a connection and of each read.
+# Of a whole try: name, connection, and the answer's head, however slowly its bytes come.
 TIMEOUT_S = 8.0
 # Between the tries of one invocation; with these, and the timeout of each, it ends within a minute.
 PAUSES_S = (1.0, 4.0)
-_SKIPPED_BYTES = 4096
 
 
 class WebhookError(Exception):
@@ -38,10 +42,11 @@ class StoredWebhook:
         parameter: str,
         *,
         plain: bool = False,
+        timeout_s: float = TIMEOUT_S,
         clock: Callable[[], float] = time.time,
         pause: Callable[[float], object] = time.sleep,
     ) -> None:
-        self._parameter, self._plain = parameter, plain
+        self._parameter, self._plain, self._timeout_s = parameter, plain, timeout_s
         self._clock, self._pause = clock, pause
         self._webhook: Webhook | None = None
 
@@ -71,23 +76,21 @@ class StoredWebhook:
         if parts.scheme == "https":
             context = ssl.create_default_context(cafile=clients.authorities())
             connection: http.client.HTTPConnection = http.client.HTTPSConnection(
-                parts.netloc, timeout=TIMEOUT_S, context=context
+                parts.netloc, timeout=self._timeout_s, context=context
             )
         else:
-            connection = http.client.HTTPConnection(parts.netloc, timeout=TIMEOUT_S)
+            connection = http.client.HTTPConnection(parts.netloc, timeout=self._timeout_s)
+        made = headers(webhook.secret, body, int(self._clock()), delivery)
         try:
-            made = headers(webhook.secret, body, int(self._clock()), delivery)
-            connection.request("POST", target, body, dict(made))
-            answer = connection.getresponse()
-            answer.read(_SKIPPED_BYTES)
+            status = _posted(connection, target, body, made, self._timeout_s)
+        except LateError:
+            raise WebhookError(f"{place} did not answer within {self._timeout_s:g} s") from None
         except (OSError, http.client.HTTPException) as error:
             raise WebhookError(f"{place} did not answer: {type(error).__name__}") from error
-        finally:
-            connection.close()
         # A redirect is no answer either: the message is for this address alone.
-        if not 200 <= answer.status < 300:
-            raise WebhookError(f"{place} answered {answer.status}")
-        return answer.status
+        if not 200 <= status < 300:
+            raise WebhookError(f"{place} answered {status}")
+        return status
 
     def _read(self) -> Webhook | None:
         ssm = connect("ssm")
@@ -101,3 +104,36 @@ class StoredWebhook:
             return stored_webhook(answer["Parameter"].get("Value", ""), plain=self._plain)
         except ContractError as error:
             raise WebhookError(str(error)) from None
+
+
+def _posted(
+    connection: http.client.HTTPConnection, target: str, body: bytes, made: Mapping[str, str], seconds: float
+) -> int:
+    """The status of a request's answer; raises `LateError` after so many seconds.
+
+    A socket's timeout is that of each read alone, and looking up a name has none: so it is another thread
+    that waits for them.
+    """
+    status: Future[int] = Future()
+    late = threading.Event()
+
+    def post() -> None:
+        try:
+            connection.connect()
+            if not late.is_set():  # it was told that nothing came
+                connection.request("POST", target, body, dict(made))
+                status.set_result(connection.getresponse().status)
+        except Exception as error:  # noqa: BLE001 - raised where the status is awaited
+            status.set_exception(error)
+        finally:
+            connection.close()
+
+    threading.Thread(target=post, name="webhook", daemon=True).start()
+    try:
+        return status.result(seconds)
+    finally:
+        late.set()
+        # Ends a thread that still waits.
+        if (waiting := connection.sock) is not None:
+            with suppress(OSError):
+                waiting.shutdown(socket.SHUT_RDWR)

@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import threading
 from dataclasses import replace
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 import pytest
+from mcap.reader import make_reader
 
+from iort_agent.agent import Agent
 from iort_agent.common.state import Files
-from iort_agent.config import load_config
+from iort_agent.common.threads import SystemClock
+from iort_agent.config import Config, load_config, without_sources
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
 from iort_agent.files.folder import STATE, Folder, Uploads
 from iort_agent.files.upload import ByteRate, GaveWayError, Outcome, Sender, make_uploader, trusting
 from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.recorder.config import RecorderConfig
+from iort_agent.runtime import Runtime
+from iort_agent.sources.sim import SimConfig
+from iort_agent.spool import REJECT_NEW
 from iort_agent.status import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
 from iort_contract.limits import SCHEMA_VERSION
+from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.files import (
     PART_BYTES,
     Address,
@@ -27,10 +36,13 @@ from iort_contract.messages.files import (
     encode_file_answer,
     file_key,
 )
-from iort_contract.topics import FILE, PING, build_topic
-from testkit.agent import Loopback, ManualClock, link_of
+from iort_contract.messages.recorder import UPLOADED, Take, Trigger, Wanted
+from iort_contract.topics import ACCEPTED, FILE, PING, build_topic
+from testkit.agent import Loopback, ManualClock, MemorySpool, link_of
 from tests.store_standin import store
 from tests.unit.agent.recorder import rig as recorder_rig
+from tests.unit.agent.recorder.rig import S
+from tests.unit.agent.recorder.test_recorder import Bench
 from tests.unit.agent.test_agent import config_file
 
 
@@ -520,3 +532,83 @@ def test_an_incident_reaches_the_bucket_after_a_refusal_and_a_restart(rig, tmp_p
     assert recorder.states() == ["kept", "uploaded"]
     assert recorder.plan.incidents == {}
     assert list(recorder.files.glob("*.mcap")) == []
+
+
+def left_by_a_killed_agent(ring):
+    """A ring with an open incident of messages that were written; the messages."""
+    began_us = SystemClock().now_us() - 60 * S
+    bench = Bench(ring, now_us=began_us)
+    bench.want(takes=(Take("a" * 16, began_us, began_us + 20 * S, "anna", "look"),))
+    emit = bench.recorder.around(lambda *_, **__: 0.0)
+    for i in range(50):
+        emit("imu", bench.clock.now_us(), {"x": i})
+        bench.clock.advance(0.2)
+        bench.recorder.ring.work()
+    bench.recorder.ring.work(ending=True)
+    bench.recorder.ring._folder.close()
+    return [f'{{"x":{i}}}'.encode() for i in range(50)]
+
+
+class Flushed:
+    """A run without sources, and with a store if it shall reach one."""
+
+    def __init__(self, tmp_path, ring):
+        self.clock = SystemClock()
+        self.uplink = Loopback(self.clock, Dispatcher())
+        config = Config("car", "host", Path(), Path(), (SimConfig(),), recorder=RecorderConfig(folder=ring))
+        self.config = without_sources(config)
+        self.folder = tmp_path / "tls"
+        self.folder.mkdir(exist_ok=True)
+
+    def run(self, *, drain_s=None, certificate=None):
+        self.agent = Agent(
+            replace(self.config, root_ca=certificate),
+            uplink=self.uplink,
+            spool=MemorySpool(max_bytes=10**9, policy=REJECT_NEW),
+            clock=self.clock,
+        )
+        return Runtime(self.agent, stopped_s=0.0, progress_s=0.0).run(drain_s=drain_s)
+
+
+def test_flush_uploads_the_incidents_that_earlier_runs_left(tmp_path):
+    ring = tmp_path / "ring"
+    sent = left_by_a_killed_agent(ring)
+    flushed = Flushed(tmp_path, ring)
+    with store(flushed.uplink, flushed.folder) as (there, certificate):
+        assert flushed.run(certificate=certificate) == 0
+    ((_, content),) = there.objects.items()
+    messages = [message.data for _, _, message in make_reader(io.BytesIO(content)).iter_messages()]
+    assert messages == sent
+    states = [
+        batch.columns["state"]
+        for message in flushed.uplink.published
+        if message.topic.startswith("$aws") and message.topic.endswith("/incidents")
+        for batch in [decode_batch(message.payload)]
+    ]
+    assert states[-1][-1] == UPLOADED
+    assert list((ring / "incidents").glob("*.mcap")) == []
+
+
+def test_flush_says_what_it_leaves_of_incidents(tmp_path, caplog):
+    left_by_a_killed_agent(tmp_path / "ring")
+    flushed = Flushed(tmp_path, tmp_path / "ring")
+    assert flushed.run(drain_s=0.5) == 1
+    assert "0 incidents are still to be cut, and 1 to be uploaded" in caplog.text or (
+        "1 incidents are still to be cut, and 0 to be uploaded" in caplog.text
+    )
+
+
+def test_flush_fires_no_trigger_and_does_no_take(tmp_path):
+    bench = Bench(tmp_path / "ring")
+    bench.want(Trigger("stopped", on="stop", cooldown_s=0))
+    bench.recorder.close()
+    flushed = Flushed(tmp_path, tmp_path / "ring")
+    assert flushed.run(drain_s=1) == 0
+    recorder = flushed.agent.recorder
+    for stopped in (False, True):
+        recorder.stopped(stopped)
+    recorder.want(Wanted({}, {"b" * 16: {"from_us": 1, "to_us": 2}}))
+    recorder.step()
+    recorder.step_slowly()
+    assert recorder.incidents.counts["edges"] == 0
+    assert recorder.answers == {"stopped": ACCEPTED}, "as the next run will answer"

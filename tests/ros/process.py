@@ -5,12 +5,35 @@ from __future__ import annotations
 import signal
 import subprocess
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
+from iort_agent.errors import AgentError
+from iort_agent.status import fetch
 from testkit import ROOT
 
 WAIT_S = 120.0
+# An agent gives no notice when it has written all that it received, and neither do ROS' recorders.
+_SETTLE_S = 2.0
+
+
+def settled(socket: Path, streams: Sequence[str]) -> bool:
+    """Whether the agent has uploaded all that it received of the streams, files too, and receives nothing
+    more; False without an answer."""
+
+    def received() -> tuple[int, list[int]] | None:
+        try:
+            status = fetch(socket)
+        except AgentError:
+            return None
+        waiting = int(status["spool"]["batches"]) + int((status["files"] or {"waiting": 0})["waiting"])
+        return waiting, [status["streams"].get(stream, {}).get("samples", 0) for stream in streams]
+
+    before = received()
+    threading.Event().wait(_SETTLE_S)
+    after = received()
+    return after is not None and after == before and after[0] == 0
 
 
 class Process:

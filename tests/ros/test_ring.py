@@ -19,10 +19,9 @@ from tests.ros.test_source import WHEEL, Cars
 RATE, LEAST = 200, 600
 
 
-def agent_with_ring(graph: Any, folder: Path, topics: dict[str, Any]) -> Agent:
-    return agent_of(
-        graph, folder, {"type": f"ros{graph.ros}", "topics": topics}, more="recorder: {keep_free_mb: 0}"
-    )
+def agent_with_ring(graph: Any, folder: Path, topics: dict[str, Any], more: str = "") -> Agent:
+    source = {"type": f"ros{graph.ros}", "topics": topics}
+    return agent_of(graph, folder, source, more=f"recorder: {{keep_free_mb: 0, {more}}}")
 
 
 def killed(agent: Agent, topics: int) -> dict[str, list[tuple[Any, Any, int, bytes]]]:

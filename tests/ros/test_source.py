@@ -39,10 +39,17 @@ class Cars:
         self.graph = graph
         self._numbers = itertools.count()
 
-    def publisher(self, name: str, definition: str = WHEEL, topic: str = "/wheel", **options: Any) -> Process:
+    def publisher(
+        self,
+        name: str,
+        definition: str = WHEEL,
+        topic: str = "/wheel",
+        flags: tuple[str, ...] = (),
+        **options: Any,
+    ) -> Process:
         file = self.graph.folder / f"{name}.msg"
         file.write_text(definition)
-        arguments = [part for key, value in options.items() for part in (f"--{key}", value)]
+        arguments = [*flags, *(part for key, value in options.items() for part in (f"--{key}", value))]
         return self.graph.run(
             "publisher.py", name, topic, "strange_msgs/Wheel", file, "--field", "state.turns", *arguments
         )

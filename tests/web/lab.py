@@ -179,6 +179,7 @@ def incident(number, state, **given):
     }
 
 
+NO_PICTURE = {"jpeg": "", "topic": "", "after_s": 0.0, "field": "", "times_s": [], "values": []}
 LIMITS = {"command": "drive", "speed": "drive.speed", "steering": "drive.steering_angle"}
 LIMITS |= {"max_speed_mps": 2.0, "max_steering_rad": 0.4, "lease_ms": 500}
 
@@ -202,6 +203,10 @@ class Lab:
             incident(2, "kept", trigger="take", by="operator@lab", why="hit the kerb"),
             incident(3, "over_budget", why="hardbrake has spent its 500 MB of the day"),
         ]
+        # What an incident shows, and for which of them that was asked.
+        self.pictures = []
+        self.shown = {**NO_PICTURE, "field": "current_input"}
+        self.shown |= {"times_s": [-2.0, 0.0, 1.0, 2.0], "values": [3.0, -20.0, -21.0, -5.0]}
         self.keeps = {"accepted": True, "reason": "", "online": True}
         self.notes = []
         self.write({"robot": "car-1", "text": "changed the left front tyre"})
@@ -225,6 +230,12 @@ class Lab:
         low, high = int(asked["from_us"]), int(asked.get("to_us", 2**53))
         found = [one for one in self.incidents if one["to_us"] >= low and one["from_us"] < high]
         return {"incidents": found, "found": len(found)}
+
+    def picture(self, asked):
+        self.pictures.append(asked["id"])
+        if self.refuses:
+            raise StationError("the file is not in the bucket any more")
+        return self.shown
 
     def keep(self, asked):
         self.asked.append(dict(asked))
@@ -323,6 +334,7 @@ class Lab:
             "insights": insights,
             "notes": self.answer_notes,
             "incidents": self.answer_incidents,
+            "incident_picture": self.picture,
             "incident_counts": lambda _: {"counts": {"car-1": len(self.incidents), "car-9": 1}},
             "motion": self.motion,
             "laps": of_laps(analysis.laps),

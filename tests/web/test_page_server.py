@@ -9,6 +9,7 @@ import json
 import socket
 import stat
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, closing, suppress
 from functools import partial
 from urllib.parse import urlsplit
@@ -19,6 +20,7 @@ from aiohttp import web
 from iort_station.errors import StationError, UsageError
 from iort_station.page import invitations
 from iort_station.page.background import BackgroundServer
+from iort_station.page.history import MOST_BYTES
 from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import PageServer, on_loopback
 from testkit.ports import free_port
@@ -486,3 +488,62 @@ def test_a_server_that_cannot_start_says_so():
 
     with pytest.raises(RuntimeError, match="a fault at the start"):
         Broken().start()
+
+
+def test_an_answer_that_the_browser_has_is_not_sent_again(built):
+    with PageServer(
+        **SETTINGS, built=built, answers={"incident_picture": lambda _: {"jpeg": "x" * 999}}
+    ) as page:
+        first, body = ask(page, "/incident_picture.json?id=1")
+        again, nothing = ask(
+            page, "/incident_picture.json?id=1", headers={"If-None-Match": first.headers["ETag"]}
+        )
+        other, _ = ask(page, "/incident_picture.json?id=1", headers={"If-None-Match": 'W/"other"'})
+    assert (first.status, len(json.loads(body)["jpeg"])) == (200, 999)
+    assert (again.status, nothing, again.headers["ETag"]) == (304, b"", first.headers["ETag"])
+    assert other.status == 200
+
+
+def test_pictures_of_incidents_hold_up_neither_each_other_nor_reading(built):
+    """A browser has one made at a time; others of the page's answers have their places."""
+    may, begun = threading.Event(), threading.Semaphore(0)
+    making = []
+
+    def picture(asked):
+        making.append(asked["id"])
+        begun.release()
+        assert may.wait(30)
+        return {"jpeg": ""}
+
+    answers = {"incident_picture": picture, "robots": lambda _: {"robots": {}}}
+    with PageServer(**SETTINGS, built=built, answers=answers) as page, ThreadPoolExecutor(6) as viewers:
+        asked = [viewers.submit(ask, page, f"/incident_picture.json?id={i}") for i in range(6)]
+        assert begun.acquire(timeout=30)
+        # Whoever reads something else has an answer meanwhile, more often than there are places in all.
+        assert [ask(page, "/robots.json")[0].status for _ in range(20)] == [200] * 20
+        assert len(making) == 1
+        may.set()
+        assert [one.result()[0].status for one in asked] == [200] * 6
+
+
+def test_a_file_of_the_most_bytes_is_sent_whole(built):
+    """It has no content on the disk, so that a test can have it."""
+
+    def download(_asked, folder):
+        path = folder / "brake.mcap"
+        with path.open("wb") as file:
+            file.truncate(MOST_BYTES)
+        return path
+
+    with PageServer(**SETTINGS, built=built, downloads={"incident.mcap": download}) as page:
+        address = urlsplit(page.url)
+        with closing(
+            http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
+        ) as connection:
+            connection.request("GET", "/incident.mcap")
+            answer = connection.getresponse()
+            assert answer.headers["Content-Length"] == str(MOST_BYTES)
+            taken = 0
+            while part := answer.read(2**20):
+                taken += len(part)
+    assert taken == MOST_BYTES

@@ -238,14 +238,14 @@ class Note:
 
 def encode_note(note: Note) -> dict[str, Any]:
     """The note as an object for JSON; raises `ContractError` if it is invalid."""
-    _check(note)
+    check_note(note)
     return dict(vars(note))
 
 
 def decode_note(content: Mapping[str, Any]) -> Note:
     """Decode a note; raises `ContractError`."""
     note = read(Note, {**content, T_US: content.get("t_us")})
-    _check(note)
+    check_note(note)
     return note
 
 
@@ -254,7 +254,8 @@ def check_note_id(note_id: str) -> str:
     return checked(_NOTE, note_id, "note", "the id of a note, 16 digits, a dash and 8 of 0-9 a-f")
 
 
-def _check(note: Note) -> None:
+def check_note(note: Note) -> None:
+    """Raises `ContractError` for a note that cannot be written."""
     for name, value, least, most in (
         ("text", note.text, 1, MAX_NOTE_CHARACTERS),
         ("by", note.by, 0, MAX_AUTHOR_CHARACTERS),

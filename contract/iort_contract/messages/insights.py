@@ -114,6 +114,19 @@ class IncidentsAnswer(TypedDict):
     found: int
 
 
+class IncidentPicture(TypedDict):
+    """Answers ``incident_picture``: what its file shows. ``jpeg``, in base64, is the image of ``topic``
+    nearest to the edge, ``after_s`` later. Without an image they are empty, and ``field`` has ``values``
+    at ``times_s`` after the edge; without those, it is empty too."""
+
+    jpeg: str
+    topic: str
+    after_s: float
+    field: str
+    times_s: list[float]
+    values: list[float]
+
+
 class IncidentCounts(TypedDict):
     """Answers ``incident_counts``: how many incidents of the last day each robot has, if it has any."""
 

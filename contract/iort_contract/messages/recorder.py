@@ -41,6 +41,9 @@ KEPT, UPLOADED, NOTIFIED, OVER_BUDGET, LOST = "kept", "uploaded", "notified", "o
 STATES = (KEPT, UPLOADED, NOTIFIED, OVER_BUDGET, LOST)
 # Among an incident's triggers, that an operator took it.
 TAKE = "take"
+# In an incident's file: its two records of metadata, and what a channel's metadata has the stream as.
+ABOUT_RECORD, ACCOUNT_RECORD = "iort.incident", "iort.account"
+CHANNEL_STREAM = "iort_stream"
 
 _TOPIC = re.compile(r"[A-Za-z0-9_/*~.-]{1,128}")
 _US = 1_000_000

@@ -65,10 +65,11 @@ class RosMessage(Mapping[str, Value]):
 
     ``large`` are the bytes of its ``uint8[]`` fields, to be stored elsewhere; ``beside`` are fields of the
     sample that are not in the message, such as the place of those bytes. ``arrival_us`` is when it came, by
-    the receiver's clock; 0 if nobody knows.
+    the receiver's clock; 0 if nobody knows. ``latched_by`` is the publisher that gives the message to later
+    subscribers, too; None of one that does not.
     """
 
-    __slots__ = ("_values", "arrival_us", "beside", "kind", "large", "raw")
+    __slots__ = ("_values", "arrival_us", "beside", "kind", "large", "latched_by", "raw")
 
     def __init__(
         self,
@@ -78,10 +79,12 @@ class RosMessage(Mapping[str, Value]):
         large: Mapping[str, Large] | None = None,
         beside: Mapping[str, Value] | None = None,
         arrival_us: int = 0,
+        latched_by: str | None = None,
     ) -> None:
         self.raw = raw
         self.kind = kind
         self.arrival_us = arrival_us
+        self.latched_by = latched_by
         self.large = large or {}
         self.beside = beside or {}
         self._values: Mapping[str, Value] | None = None

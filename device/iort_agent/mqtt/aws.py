@@ -8,6 +8,7 @@ batches. Every session is clean: a broker that lost the session would otherwise 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import threading
@@ -19,11 +20,12 @@ from awscrt import mqtt5
 from iort_agent.common.state import Connection
 from iort_agent.common.threads import Clock, Supervised
 from iort_agent.errors import IdentityError, UplinkError
-from iort_agent.mqtt.client import Broker, ClientFactory, keep_state, send_at_once
+from iort_agent.mqtt.client import Broker, ClientFactory, Network, keep_state, send_at_once
 from iort_agent.mqtt.dispatch import Dispatcher, Subscriptions
 from iort_agent.mqtt.failures import (
     SETTLED_S,
     SHORTEST_S,
+    UNSTEADY,
     Backoff,
     Causes,
     error_name,
@@ -56,6 +58,8 @@ class IotCore:
         dispatcher: Dispatcher,
         keep_alive_s: int = KEEP_ALIVE_S,
         ping_timeout_s: float = PING_TIMEOUT_S,
+        network: Callable[[], Network] = Network,
+        backoff: Backoff | None = None,
     ) -> None:
         self._broker, self._endpoint = broker, f"{broker.endpoint}:{broker.port}"
         self._client_id = broker.client_id
@@ -65,12 +69,13 @@ class IotCore:
         self._client: Any = None
         self._generation = 0
         self._thread = Supervised("uplink", self._keep_connected)
-        self._backoff = Backoff()
+        self._backoff = backoff or Backoff()
+        self._network = network
         self._causes = Causes()
         # Set when the attempt or the connection has ended, or should end.
         self._down, self._client_stopped = threading.Event(), threading.Event()
         self._stop = threading.Event()
-        self._slow = False
+        self._pace = UNSTEADY
         self._connected = False
         self._connects = 0
         self._since = clock.monotonic()
@@ -165,11 +170,15 @@ class IotCore:
 
     def _keep_connected(self) -> None:
         """Connect again and again until `stop`."""
+        with contextlib.closing(self._network()) as network:
+            self._connect_until_stop(network)
+
+    def _connect_until_stop(self, network: Network) -> None:
         while not self._stop.is_set():
             began = self._clock.monotonic()
             self._down.clear()
             self._client_stopped.clear()
-            self._slow = False
+            self._pace = UNSTEADY
             if self._stop.is_set():
                 break
             try:
@@ -183,7 +192,7 @@ class IotCore:
                 # After an error, too: a client that is left started would connect again tomorrow.
                 self._stop_client()
             if not self._stop.is_set():
-                self._pause(began)
+                self._pause(began, network)
 
     def _stop_client(self) -> None:
         self._client.stop(mqtt5.DisconnectPacket() if self._connected else None)
@@ -191,18 +200,22 @@ class IotCore:
             _log.warning("the MQTT client did not stop in time; using a new one")
             self._try_new_client()
 
-    def _pause(self, began: float) -> None:
-        """Wait until the next attempt is due. Replaced files make it due a second after the last one."""
-        earliest = began + SHORTEST_S
-        due = max(earliest, self._clock.monotonic() + self._backoff.next_s(slow=self._slow))
+    def _pause(self, began: float, network: Network) -> None:
+        """Wait until the next attempt is due. Replaced files make it due a second after the last one, and a
+        network that comes does after the shortest wait for the cause."""
+        earliest, pace = began + SHORTEST_S, self._pace
+        due = max(earliest, self._clock.monotonic() + self._backoff.next_s(pace))
         while not self._stop.is_set():
             if self._factory.replaced():
                 due = earliest
                 self._try_new_client()
+            if network.came():
+                soon = self._clock.monotonic() + self._backoff.came_back_s()
+                due = min(due, max(began + pace.shortest_s, soon))
             left = due - self._clock.monotonic()
             if left <= 0:
                 return
-            self._clock.wait(self._stop, min(left, _LOOK_S))
+            self._clock.wait(self._stop, min(left, SHORTEST_S))
 
     def _try_new_client(self) -> None:
         try:
@@ -256,11 +269,11 @@ class IotCore:
                 now_us=self._clock.now_us(),
                 hung_up=self._causes.hung_up,
             )
-            self._slow = cause.slow
+            self._pace = cause.pace
             self._last_error = cause.text
             level = logging.DEBUG
             if self._causes.is_news(cause):
-                level = logging.ERROR if cause.slow else logging.WARNING
+                level = logging.ERROR if cause.pace.person else logging.WARNING
             _log.log(level, "cannot connect to %s as %s: %s", self._endpoint, self._client_id, cause.text)
         self._down.set()
 

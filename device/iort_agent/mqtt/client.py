@@ -5,13 +5,15 @@ whose Python state is made anew for each call, and small messages that wait for 
 from __future__ import annotations
 
 import ctypes
+import errno
 import functools
 import logging
 import os
 import socket
+import struct
 import threading
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Iterator, NamedTuple
 
 from awscrt import io, mqtt5
 from awsiot import mqtt5_client_builder
@@ -24,6 +26,11 @@ _log = logging.getLogger(__name__)
 _ACK_TIMEOUT_S = 20
 # The client's own reconnects come so late that ours are always first.
 _NEVER_MS = 24 * 3600 * 1000
+# linux/rtnetlink.h: notices of addresses and routes of IPv4 and IPv6 (RTMGRP_*), and those of new ones
+# (RTM_NEWADDR, RTM_NEWROUTE). A message begins with its length and kind.
+_GROUPS = 0x10 | 0x40 | 0x100 | 0x400
+_NEW = (20, 24)
+_NOTICE, _NOTICE_BYTES = struct.Struct("=IH10x"), 65_536
 _thread = threading.local()
 _DESCRIPTORS = Path("/proc/self/fd")
 _TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
@@ -102,6 +109,58 @@ class ClientFactory:
             return self._certificate.validity() if self._certificate is not None else None
         except IdentityError:
             return None
+
+
+class Network:
+    """Tells when this machine gets an address or a route, as it does when it is in reach of its Wi-Fi again.
+
+    The kernel sends its notices to a socket. Where there are none (not Linux, or forbidden), `came` is False.
+    """
+
+    def __init__(self, notices: socket.socket | None = None) -> None:
+        self._notices = notices or _kernels_notices()
+
+    def close(self) -> None:
+        """Hear no notices any more."""
+        if self._notices is not None:
+            self._notices.close()
+
+    def came(self) -> bool:
+        """Whether one came since the last call."""
+        came = False
+        while self._notices is not None:
+            try:
+                data = self._notices.recv(_NOTICE_BYTES)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                # There may have been more notices than the kernel keeps.
+                return error.errno == errno.ENOBUFS
+            came |= any(kind in _NEW for kind in _kinds(data))
+        return came
+
+
+def _kernels_notices() -> socket.socket | None:
+    notices = None
+    try:
+        notices = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE)
+        notices.setblocking(False)
+        notices.bind((0, _GROUPS))
+    except (AttributeError, OSError) as error:
+        _log.debug("the kernel tells of no network: %s", error)
+        if notices is not None:
+            notices.close()
+        return None
+    return notices
+
+
+def _kinds(data: bytes) -> Iterator[int]:
+    """The kinds of netlink's messages, which are aligned to 4 bytes."""
+    at = 0
+    while at + _NOTICE.size <= len(data):
+        length, kind = _NOTICE.unpack_from(data, at)
+        yield kind
+        at += max(_NOTICE.size, (length + 3) & ~3)
 
 
 def keep_state() -> None:

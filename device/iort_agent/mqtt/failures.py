@@ -1,8 +1,8 @@
 """Why a connection to the broker failed, what the person at the robot should check, and when to try again.
 
-The agent makes at most one attempt a second, with full jitter. It retries within 1 to 30 s if the network may
-recover by itself, and within 1 to 5 minutes if a person must act, because AWS counts and throttles the
-attempts of a refused robot. Each cause is logged once, and again only after another cause or a connection.
+The agent makes at most one attempt a second, with full jitter. How long it waits depends on the cause: AWS
+counts and throttles the attempts of a refused robot, while one that drives back into its Wi-Fi must be there
+within seconds. Each cause is logged once, and again only after another cause or a connection.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from typing import Any, Callable, NamedTuple
 
 from iort_agent.identity import Validity
 
-SHORTEST_S, LONGEST_S = 1.0, 30.0
-SLOW_SHORTEST_S, SLOW_LONGEST_S = 60.0, 300.0
 # A connection that held for longer than this resets the backoff.
 SETTLED_S = 10.0
 # A broker that disconnects without an answer may be restarting. After so many in a row it is a refusal.
@@ -29,27 +27,58 @@ _REFUSALS = frozenset({_CLIENT_ID_NOT_VALID, _BAD_USER_NAME, _NOT_AUTHORIZED, _B
 _HINTS = {
     "AWS_IO_DNS_INVALID_NAME": "the endpoint's name does not resolve",
     "AWS_IO_DNS_QUERY_FAILED": "the endpoint's name does not resolve",
+    "AWS_IO_DNS_NO_ADDRESS_FOR_HOST": "the endpoint's name does not resolve",
     "AWS_IO_SOCKET_CONNECTION_REFUSED": "nothing listens at the endpoint's port",
     "AWS_IO_SOCKET_TIMEOUT": "the endpoint does not answer",
     "AWS_IO_SOCKET_NO_ROUTE_TO_HOST": "there is no network",
+    "AWS_IO_SOCKET_NETWORK_DOWN": "there is no network",
     "AWS_IO_TLS_NEGOTIATION_TIMEOUT": "the endpoint accepts connections but does not answer",
     _TLS_FAILED: "TLS failed",
     "AWS_ERROR_MQTT5_PING_RESPONSE_TIMEOUT": "the broker no longer answers",
     _HUNG_UP: "the broker or the network closed the connection",
     _CLOSED: "the broker or the network closed the connection",
 }
+_UNREACHED = frozenset(
+    {
+        "AWS_IO_DNS_INVALID_NAME",
+        "AWS_IO_DNS_QUERY_FAILED",
+        "AWS_IO_DNS_NO_ADDRESS_FOR_HOST",
+        "AWS_IO_SOCKET_TIMEOUT",
+        "AWS_IO_SOCKET_NO_ROUTE_TO_HOST",
+        "AWS_IO_SOCKET_NETWORK_DOWN",
+    }
+)
 _ADVICE = (
     "The queue keeps what is recorded meanwhile, as long as it has room. `iort-agent check` says more. "
     "The agent tries again within minutes, and at once when certificate, private_key or root_ca is replaced"
 )
 
 
+class Pace(NamedTuple):
+    """The shortest and the longest wait between attempts. ``person``: a person must act, or may have to."""
+
+    shortest_s: float
+    longest_s: float
+    person: bool = False
+
+
+SHORTEST_S = 1.0
+# No attempt reaches the broker, so none is a load for it.
+UNREACHED = Pace(SHORTEST_S, 5.0)
+UNSTEADY = Pace(SHORTEST_S, 30.0)
+# TLS ends without a reason, again and again: a refusal, or a network that resets connections.
+DOUBTFUL = Pace(5.0, 60.0, person=True)
+REFUSED = Pace(60.0, 300.0, person=True)
+# A fleet that gets its network back at once spreads its attempts over so long.
+CAME_BACK_S = 2.0
+
+
 class Cause(NamedTuple):
-    """Why the connection failed. ``kind`` identifies the cause; ``slow``: a person must act."""
+    """Why the connection failed. ``kind`` identifies the cause."""
 
     kind: str
     text: str
-    slow: bool = False
+    pace: Pace = UNSTEADY
 
 
 class Hangups(NamedTuple):
@@ -65,20 +94,23 @@ class Backoff:
     def __init__(self, chance: random.Random | None = None) -> None:
         self._chance = chance or random.Random()  # noqa: S311 - jitter, not secrets
         self._attempts = 0
-        self._slow = False
+        self._pace = UNSTEADY
 
     def reset(self) -> None:
         """Start with short waits again."""
         self._attempts = 0
 
-    def next_s(self, *, slow: bool = False) -> float:
+    def next_s(self, pace: Pace = UNSTEADY) -> float:
         """Seconds to wait. The first wait has jitter, too; otherwise a fleet would reconnect all at once."""
-        if slow != self._slow:
-            self._slow, self._attempts = slow, 0
+        if pace != self._pace:
+            self._pace, self._attempts = pace, 0
         self._attempts = min(self._attempts + 1, 16)
-        shortest, longest = (SLOW_SHORTEST_S, SLOW_LONGEST_S) if slow else (SHORTEST_S, LONGEST_S)
-        ceiling = min(longest, shortest * 2.0**self._attempts)
-        return shortest + self._chance.random() * (ceiling - shortest)
+        ceiling = min(pace.longest_s, pace.shortest_s * 2.0**self._attempts)
+        return pace.shortest_s + self._chance.random() * (ceiling - pace.shortest_s)
+
+    def came_back_s(self) -> float:
+        """Seconds to wait once a network has come."""
+        return self._chance.random() * CAME_BACK_S
 
 
 class Causes:
@@ -129,13 +161,13 @@ def why_not_connected(
     words = said(packet) if code is not None else explain(data.exception)
     suspicious = code in _REFUSALS or name in (_TLS_FAILED, _HUNG_UP, _CLOSED)
     if suspicious and (invalid := _invalid(validity(), now_us)) is not None:
-        return Cause("validity", f"{invalid} ({words}). {_ADVICE}", slow=True)
+        return Cause("validity", f"{invalid} ({words}). {_ADVICE}", REFUSED)
     if code in _REFUSALS:
         text = (
             f"{words}: the certificate is not active, not attached to a thing named {client_id}, "
             f"or its policy does not let it connect. {_ADVICE}"
         )
-        return Cause("refused", text, slow=True)
+        return Cause("refused", text, REFUSED)
     if suspicious:
         hangups = hung_up(before_tls=name == _CLOSED)
         if not hangups.often:
@@ -150,8 +182,8 @@ def why_not_connected(
             )
         # Before TLS, the broker may just as well be down behind a proxy.
         kind = f"hangup {name if hangups.refused else _CLOSED}"
-        return Cause(kind, f"{text}. {_ADVICE}", slow=hangups.refused)
-    return Cause(words, words)
+        return Cause(kind, f"{text}. {_ADVICE}", DOUBTFUL if hangups.refused else UNSTEADY)
+    return Cause(words, words, UNREACHED if name in _UNREACHED else UNSTEADY)
 
 
 def _invalid(validity: Validity | None, now_us: int) -> str | None:

@@ -122,9 +122,12 @@ class Account:
         # Run of the agent -> its first and last time in the window, and when nobody listened between them.
         self.runs: dict[str, list[int]] = {}
         self.pauses: list[tuple[int, int, str]] = []
+        # Topic -> the latched messages before the window: who published them, and when they came.
+        self.latched: dict[str, list[tuple[str, int]]] = {}
 
     def take(self, message: RingMessage, *, kept: bool, early: bool) -> None:
-        """Count a message; those just outside of the window, ``early`` or later, tell of gaps at its ends."""
+        """Count a message of the window; those just outside of it, ``early`` or later, tell of gaps at its
+        ends."""
         channel = message.channel
         topic = self._topics.get(channel.topic)
         if topic is None:
@@ -133,6 +136,12 @@ class Account:
         self.messages += kept
         run = self.runs.setdefault(channel.run, [message.ring_us, message.ring_us])
         run[0], run[1] = min(run[0], message.ring_us), max(run[1], message.ring_us)
+
+    def latch(self, publisher: str, message: RingMessage) -> None:
+        """Note a latched message that is in force at the window's begin; it is none of the window."""
+        channel = message.channel
+        self._topics.setdefault(channel.topic, _Topic(channel.stream))
+        self.latched.setdefault(channel.topic, []).append((publisher, message.ring_us))
 
     def close(
         self, drops: Sequence[Drop], losses: Counted, wanted: Callable[..., bool]
@@ -161,6 +170,7 @@ class Account:
                 "stream": stream,
                 "messages": topic.messages,
                 "missing": sum(causes.values()),
+                **({"latched": len(self.latched[name])} if name in self.latched else {}),
                 **({"why": causes} if causes else {}),
             }
             self.missing += sum(causes.values())

@@ -19,7 +19,8 @@ class RecorderConfig:
     older than ``max_age_s``, and takes at most ``max_disk_share`` of the disk. It gives way while less than
     ``keep_free_mb`` of the disk are free, or what the queue may still take. ``topics`` are the ROS topics and
     streams to keep, with ``*`` for any characters. ``memory_mb`` bounds what waits to be written. A power cut
-    loses at most the last ``sync_s``; a killed process, the last second. Incidents that wait for their upload
+    loses what no closed chunk has, at most the last second, and ``sync_s`` more if that is not 0; a killed
+    process, the last second. Incidents that wait for their upload
     take ``max_mb`` more at most. ``service`` and ``topic`` are the
     ROS names by which a program on the robot triggers.
     """
@@ -34,6 +35,6 @@ class RecorderConfig:
     )
     compression: str = setting(choice(LZ4, ZSTD, NONE), LZ4)
     memory_mb: float = setting(number(1, 1000, unit="MB"), 32.0)
-    sync_s: float = setting(number(1, 60, unit="s"), 5.0)
+    sync_s: float = setting(number(0, 60, unit="s"), 0.0)
     service: str | None = setting(text(ros_name), None)
     topic: str | None = setting(text(ros_name), None)

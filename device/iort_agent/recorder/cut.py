@@ -4,7 +4,12 @@ A message belongs to the window if it came in it, or by its own time is of it. T
 it is complete and on the disk. Its metadata say why it was kept, and what is missing:
 
 - ``iort.incident``: the incident, its triggers and edges with their values, the agent and its state
-- ``iort.account``: by topic, the messages in the window, the missing ones, and why
+- ``iort.account``: by topic, the messages in the window, the missing ones, and why; and how many ``latched``
+  ones are before them
+
+The latched messages that are in force at the window's begin come first. Their log time is the begin, so
+that a player gives them at once and the file is not longer than the window; their publish time is their own.
+Topics that latch say so to `ros2 bag play`, whose subscribers would not hear them otherwise.
 """
 
 from __future__ import annotations
@@ -16,15 +21,16 @@ import os
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO, Callable, Iterator, Mapping, NamedTuple, Protocol, Sequence
+from typing import Any, BinaryIO, Callable, Container, Iterator, Mapping, NamedTuple, Protocol, Sequence
 
 from iort_agent.recorder.account import Account, Losses
 from iort_agent.recorder.config import NONE, ZSTD
+from iort_agent.recorder.latched import Latched
 from iort_agent.recorder.ledger import fits
 from iort_agent.recorder.plan import Incident
 from iort_agent.recorder.ring import Drop, RingChannel, RingMessage
+from iort_contract.messages.recorder import ABOUT_RECORD, ACCOUNT_RECORD
 
-INCIDENT, ACCOUNT = "iort.incident", "iort.account"
 PART = ".part"
 # A message's own time may be so much off the time at which it came, and it is looked for.
 SLACK_US = 1_000_000
@@ -32,6 +38,14 @@ SLACK_US = 1_000_000
 _BURST, _ROOM_EVERY = 64, 1024
 _PROFILES = {"ros1": "ros1", "cdr": "ros2"}
 _LIBRARY = "iort-agent"
+# What a player of ROS 2 offers for a topic that latches, in the form that every rosbag2 since Foxy reads.
+_QOS = "offered_qos_profiles"
+_NEVER = "{sec: 2147483647, nsec: 4294967295}"
+_LATCHES = (
+    "- {history: 1, depth: 16, reliability: 1, durability: 1, "
+    f"deadline: {_NEVER}, lifespan: {_NEVER}, liveliness: 1, liveliness_lease_duration: {_NEVER}, "
+    "avoid_ros_namespace_conventions: false}\n"
+)
 
 
 class TooLargeError(Exception):
@@ -43,6 +57,7 @@ class Source(Protocol):
 
     def read(self, from_us: int, to_us: int, wanted: Sequence[str] | None) -> Iterator[RingMessage]: ...
     def drops(self, from_us: int, to_us: int) -> Sequence[Drop]: ...
+    def latched(self, at_us: int, wanted: Sequence[str] | None) -> Latched: ...
     def since_us(self) -> int: ...
 
 
@@ -81,8 +96,8 @@ class _Hashed:
 class _Channels:
     """Registers each channel of the ring once; runs of the agent share one if nothing has changed."""
 
-    def __init__(self, writer: Any) -> None:
-        self._writer = writer
+    def __init__(self, writer: Any, latching: Container[str]) -> None:
+        self._writer, self._latching = writer, latching
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._ids: dict[tuple[object, ...], int] = {}
         self._known: dict[int, tuple[RingChannel, int]] = {}
@@ -100,6 +115,8 @@ class _Channels:
                 else 0
             )
         metadata = dict(channel.metadata)
+        if channel.topic in self._latching and _QOS in metadata:
+            metadata[_QOS] = _LATCHES
         key = (channel.topic, channel.encoding, self._schemas[schema], tuple(sorted(metadata.items())))
         if key not in self._ids:
             self._ids[key] = self._writer.register_channel(
@@ -144,8 +161,8 @@ def cut(
         lost = losses.between(incident.ring_from_us, incident.ring_to_us)
         topics = account.close(drops, lost, partial(fits, incident.topics or ["*"]))
         account.late_us = max(0, ring.since_us() - incident.ring_from_us)
-        writer.add_metadata(INCIDENT, _about(incident, account, losses))
-        writer.add_metadata(ACCOUNT, {topic: json.dumps(counts) for topic, counts in topics.items()})
+        writer.add_metadata(ABOUT_RECORD, _about(incident, account, losses))
+        writer.add_metadata(ACCOUNT_RECORD, {topic: json.dumps(counts) for topic, counts in topics.items()})
         writer.finish()
         file.flush()
         os.fsync(file.fileno())
@@ -156,24 +173,33 @@ def cut(
 
 def _copied(ring: Source, incident: Incident, writer: Any, account: Account) -> Iterator[None]:
     """Copies the messages of the window, a step each."""
-    channels = _Channels(writer)
-    from_us, to_us = incident.ring_from_us, incident.ring_to_us
-    messages = ring.read(from_us - SLACK_US, to_us + SLACK_US, incident.topics or None)
+    from_us, to_us, wanted = incident.ring_from_us, incident.ring_to_us, incident.topics or None
+    # What the ring has not any more of the window is in force, too.
+    since_us = ring.since_us()
+    latched = ring.latched(max(from_us, min(since_us, to_us)), wanted)
+    channels = _Channels(writer, latched.topics)
+    messages = ring.read(from_us - SLACK_US, to_us + SLACK_US, wanted)
     first = next(messages, None)
     # rosbags opens what says that it is ROS 2's.
     writer.start(_PROFILES.get(first.channel.encoding, "") if first is not None else "", _LIBRARY)
+    for publisher, message in latched.messages:
+        read = message.ring_us >= max(from_us - SLACK_US, since_us)
+        if read and incident.from_us <= message.t_us <= incident.to_us:
+            continue  # it is of the window by its own time
+        account.latch(publisher, message)
+        _copy(writer, channels, message, max(from_us, message.ring_us))
+        yield
     for message in chain([first] if first is not None else [], messages):
         kept = from_us <= message.ring_us <= to_us or incident.from_us <= message.t_us <= incident.to_us
         account.take(message, kept=kept, early=message.ring_us < from_us)
         if kept:
-            writer.add_message(
-                channels.id_of(message.channel),
-                message.ring_us * 1000,
-                message.data,
-                message.t_us * 1000,
-                message.seq & 0xFFFFFFFF,
-            )
+            _copy(writer, channels, message, message.ring_us)
         yield
+
+
+def _copy(writer: Any, channels: _Channels, message: RingMessage, log_us: int) -> None:
+    number, sequence = channels.id_of(message.channel), message.seq & 0xFFFFFFFF
+    writer.add_message(number, log_us * 1000, message.data, message.t_us * 1000, sequence)
 
 
 def _about(incident: Incident, account: Account, losses: Losses) -> Mapping[str, str]:
@@ -193,6 +219,10 @@ def _about(incident: Incident, account: Account, losses: Losses) -> Mapping[str,
         "ring_from_us": str(incident.ring_from_us),
         "ring_to_us": str(incident.ring_to_us),
         "topics": json.dumps(incident.topics),
+        # The incident that has what was before, with this one's topics, if it was cut already.
+        "follows": incident.follows,
+        # Topic -> the latched messages before the window: publisher, and when they came (0: nobody knows).
+        "latched": json.dumps(account.latched),
         "messages": str(account.messages),
         "missing": str(account.missing),
         # Before this the ring has nothing any more, or was not there yet.

@@ -62,6 +62,8 @@ class RingFolder:
         self._lock = threading.Lock()
         # Up to when, in the ring's time, and why.
         self.evicted_us, self.evicted_why = 0, ""
+        # What the ring has beside its segments, within the same bound.
+        self.beside_bytes = 0
         self._synced = True
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -86,6 +88,11 @@ class RingFolder:
         """The closed segments, oldest first."""
         with self._lock:
             return tuple(self._segments)
+
+    def since_us(self, began_us: int) -> int:
+        """The earliest time that is still there; ``began_us`` if nothing was evicted."""
+        segments = self.segments()
+        return segments[0].from_us if segments else max(began_us, self.evicted_us)
 
     def begin(self, from_us: int) -> SegmentFile:
         """Begin a segment, with room for a whole one. Raises `OSError`."""
@@ -136,15 +143,15 @@ class RingFolder:
         share = round(config.max_disk_share * disk.f_blocks * disk.f_frsize)
         if share < allowed:
             allowed, why = share, SHARE
-        while self._bytes() > max(0, allowed - LEAST_BYTES):
-            self._evict_one(why)
+        while self._bytes() > max(0, allowed - LEAST_BYTES) and self._evict_one(why):
+            pass
 
     def make_room(self) -> bool:
         """Delete the oldest segment, for a disk that is full; whether there was one."""
         return self._evict_one(FULL)
 
     def _bytes(self) -> int:
-        return sum(segment.size for segment in self._segments)
+        return self.beside_bytes + sum(segment.size for segment in self._segments)
 
     def _evict_one(self, why: str) -> bool:
         with self._lock:

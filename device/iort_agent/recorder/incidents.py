@@ -51,7 +51,7 @@ _TOLD_S = 2.0
 _RETRY_S, _MAX_RETRY_S, _FLUSH_S, _GIVE_UP_FLUSH_US = 2.0, 60.0, 2.0, 30_000_000
 # What waits to be cut or uploaded; each is small in the plan, and the files are bounded in bytes.
 _MAX_INCIDENTS = 200
-_PAUSE_S = 0.002
+_PAUSE_S, _EMPTY_LOOK_S = 0.002, 0.05
 # A take that ends later would wait for ever where a clock is wrong.
 _MAX_AHEAD_US = round(MAX_AFTER_S * 1e6)
 
@@ -203,6 +203,16 @@ class Incidents:
             states = [incident.state for incident in self._plan.incidents.values()]
         return {"open": states.count(OPEN), "waiting": states.count(KEPT)}
 
+    def wait_empty(self, timeout_s: float) -> bool:
+        """Wait until no incident waits to be cut or uploaded; whether none does."""
+        until, never = self._clock.monotonic() + timeout_s, threading.Event()
+        while any(self.waiting().values()):
+            if self._clock.monotonic() >= until:
+                return False
+            # Nobody signals it.
+            self._clock.wait(never, _EMPTY_LOOK_S)
+        return True
+
     def _add(self, incident: Incident) -> None:
         """Note a new incident, or add its edge to one whose window it overlaps."""
         plan = self._plan
@@ -245,6 +255,8 @@ class Incidents:
                 return  # another window was merged into it just now
             # From here on none is.
             done = bool(incident.key) and path.exists()
+            if not done:
+                self._plan.follow(incident)
             incident.key = incident.key or "cutting"
             left = self._plan.left(incident, self._clock.now_us())
             free = self._max_bytes - self._waiting_bytes()
@@ -277,6 +289,7 @@ class Incidents:
                 _sync(self.folder)
         with self._plan.lock:
             self._plan.spend(incident, self._clock.now_us())
+            self._plan.note_cut(incident)
             self._held.pop(incident.id, None)
             self.alarm = None
             self._turn(incident, KEPT)
@@ -289,8 +302,9 @@ class Incidents:
         with self._plan.lock:
             incident.key = file_key(self._robot, file)
             incident.size, incident.messages, incident.missing = made.size, made.messages, made.missing
-            if _late(made):
-                incident.why = f"begins late{_late(made)}"
+            follows = f"follows {incident.follows}" if incident.follows else ""
+            late = f"begins late{_late(made)}" if _late(made) else ""
+            incident.why = "; ".join(filter(None, (follows, late)))
             if not self._plan.save():
                 raise OSError(self._plan.alarm)
 

@@ -39,6 +39,8 @@ MAX_EDGES = 32
 # The budget of a day that has just ended may still be asked for: the clock may be set back.
 _DAYS = 2
 _TAKES = 32
+# Incidents that others may follow.
+_CUTS = 32
 # Of a text in an edge, and in what readers are told.
 MAX_TEXT = 1000
 
@@ -61,7 +63,7 @@ class Incident:
     """What is kept of a window. The window is in the robot's time, and in the ring's, which is never set.
 
     ``budgets`` are the bytes a day of its triggers, which may be changed or removed meanwhile. ``told`` is
-    the state that the queue on disk has for certain.
+    the state that the queue on disk has for certain, and ``follows`` the incident that has what was before.
     """
 
     id: str
@@ -82,6 +84,7 @@ class Incident:
     size: int = 0
     messages: int = 0
     missing: int = 0
+    follows: str = ""
 
     @property
     def triggers(self) -> list[str]:
@@ -154,6 +157,8 @@ class Plan:
         # Trigger -> its last edge that counted; day -> trigger -> bytes.
         self.last_us: dict[str, int] = {}
         self.spent: dict[str, dict[str, int]] = {}
+        # Id -> window in the ring's time, and topics, of incidents that have their file; the newest last.
+        self.cut: dict[str, tuple[int, int, list[str]]] = {}
         self.alarm: str | None = None
         self._changed = False
         self._load()
@@ -166,6 +171,7 @@ class Plan:
             "takes": self.takes,
             "last_us": self.last_us,
             "spent": self.spent,
+            "cut": self.cut,
         }
         try:
             write_below(self.folder, PurePath(FILE), json.dumps(content).encode(), sync=True)
@@ -196,6 +202,26 @@ class Plan:
                 return other
         return None
 
+    def follow(self, incident: Incident) -> None:
+        """Let an incident begin where the last ones ended that have their files and all of its topics.
+        What a person asks for is whole."""
+        if any(not edge.trigger for edge in incident.edges):
+            return
+        for known, (from_us, to_us, topics) in self.cut.items():
+            if topics and not (incident.topics and {*incident.topics} <= {*topics}):
+                continue
+            begin_us = incident.ring_from_us
+            if known != incident.id and from_us <= begin_us <= to_us < incident.ring_to_us:
+                incident.follows = known
+                incident.from_us += to_us + 1 - begin_us
+                incident.ring_from_us = to_us + 1
+
+    def note_cut(self, incident: Incident) -> None:
+        """Note that an incident has its file."""
+        self.cut[incident.id] = incident.ring_from_us, incident.ring_to_us, incident.topics
+        while len(self.cut) > _CUTS:
+            del self.cut[next(iter(self.cut))]
+
     def left(self, incident: Incident, now_us: int) -> int | None:
         """The bytes that the trigger with the most left may still spend today; None without a limit."""
         spent = self.spent.get(_day(now_us), {})
@@ -223,6 +249,7 @@ class Plan:
             ]
             self.triggers, self.takes = dict(content["triggers"]), dict(content["takes"])
             self.last_us, self.spent = dict(content["last_us"]), dict(content["spent"])
+            self.cut = {key: (one[0], one[1], one[2]) for key, one in content.get("cut", {}).items()}
         except FileNotFoundError:
             return
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:

@@ -73,10 +73,12 @@ class Recorder:
         replayed: Callable[[str], bool] = lambda _: False,
         agent: Callable[[], Mapping[str, Any]] = dict,
         graph: Graph | None = None,
+        fires: bool = True,
     ) -> None:
-        """Raises `AgentError` if the folder cannot be used, or as `Ring`."""
+        """Without ``fires``, what earlier runs have begun is ended, and nothing else. Raises `AgentError` if
+        the folder cannot be used, or as `Ring`."""
         assert config.folder is not None, "load_config names it"
-        self._clock, self._connection, self._graph = clock, connection, graph
+        self._clock, self._connection, self._graph, self._fires = clock, connection, graph, fires
         folder = _made(config.folder)
         self.ring = Ring(config, clock, folder=folder, run=run, reserve=reserve)
         self._plan = Plan(folder)
@@ -185,6 +187,8 @@ class Recorder:
 
     def step(self, *, last: bool = False) -> None:
         """Evaluate what has come; the recorder's thread calls it. ``last``: no samples come any more."""
+        if not self._fires:
+            return
         self._triggers.step(last=last)
         while self._events:
             on, why = self._events.popleft()
@@ -194,6 +198,8 @@ class Recorder:
 
     def step_slowly(self) -> None:
         """Do what is due once a second."""
+        if not self._fires:
+            return
         self._losses.look(self.ring.now_us())
         self._look_at_connection()
         wanted = self._wanted

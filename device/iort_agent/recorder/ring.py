@@ -7,9 +7,8 @@
           attachments, lanes
 ```
 
-A killed process loses at most the last second, which was in memory. A power cut loses at most what was
-written since the last sync, every ``sync_s``: one for each chunk would cost an SD card many small writes to
-its journal.
+A killed process loses at most the last second, which was in memory, and a power cut what no closed chunk has:
+each is synced, unless ``sync_s`` spares a medium the writes to its journal.
 
 Times of the ring are microseconds that never jump: the wall clock when the agent began, or the end of the
 ring that it found if that is later, and from there on the monotonic clock. They are an MCAP's log times; its
@@ -22,15 +21,16 @@ import logging
 import threading
 from collections import deque
 from pathlib import Path
-from typing import Any, Container, Iterable, Iterator, Mapping, Sequence, Tuple
+from typing import Any, Container, Iterable, Iterator, Mapping, Optional, Sequence, Tuple
 
 from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.threads import Clock, Supervised
 from iort_agent.recorder.config import RecorderConfig
 from iort_agent.recorder.folder import EVERY, RESTART, SLACK_US, Drop, RingFolder
+from iort_agent.recorder.latched import SHARE, Latched, LatchedFolder
 from iort_agent.recorder.ledger import DISK, ERROR, MEMORY, Counts, Ledger, Topic, fits
 from iort_agent.recorder.segment import RingChannel, RingMessage, Segment, read_segment, require_mcap
-from iort_agent.recorder.writer import RingWriter
+from iort_agent.recorder.writer import AGAIN, RingWriter
 from iort_agent.sources import Emit
 from iort_agent.sources.intake import Selected
 from iort_contract.catalog.streams import TYPES_STREAM
@@ -67,8 +67,9 @@ _OVERHEAD, _FIELD = 200, 100
 _LATE_US = 1_000_000
 
 
-# A message in memory: topic, number, ring's time, own time, what to write, and the bytes that it takes.
-_Item = Tuple[Topic, int, int, int, Any, int]
+# A message in memory: topic, number, ring's time, own time, what to write, who latches it, and the bytes that
+# it takes.
+_Item = Tuple[Topic, int, int, int, Any, Optional[str], int]
 
 
 class Ring:
@@ -91,7 +92,12 @@ class Ring:
         self._began_us = now_us
 
         self._ledger = Ledger(config.topics)
-        self._writer = RingWriter(self._folder, self._ledger, clock, run=run, sync_s=config.sync_s)
+        self._latched = LatchedFolder(
+            folder, compression=config.compression, max_bytes=round(config.max_mb * 1e6 * SHARE)
+        )
+        self._writer = RingWriter(
+            self._folder, self._ledger, clock, run=run, sync_s=config.sync_s, latched=self._latched
+        )
 
         # Under the ledger's lock.
         self._queue: deque[_Item] = deque()
@@ -119,11 +125,16 @@ class Ring:
         """Keep a sample, in memory first. Never blocks, never raises."""
         try:
             payload: Any = values
-            kind = None
+            kind = latched_by = None
             late_us = 0
-            message = values.whole if isinstance(values, Selected) else values
+            again = False
+            message: Any = values
+            if isinstance(values, Selected):
+                again = values.again
+                if values.whole is not None:
+                    message = values.whole
             if isinstance(message, RosMessage):
-                kind, payload = message.kind, message.raw
+                kind, payload, latched_by = message.kind, message.raw, message.latched_by
                 size = len(payload) + _OVERHEAD
                 if message.arrival_us:
                     late_us = self._clock.now_us() - message.arrival_us
@@ -142,14 +153,17 @@ class Ring:
             if 0 < late_us < _LATE_US:
                 ring_us -= late_us
             with self._ledger.lock:
-                topic.counts.taken += 1
-                seq = topic.seq
-                topic.seq = seq + 1
-                if self._bytes + size > self._most_bytes:
-                    self._ledger.drop(topic, MEMORY, ring_us)
+                full, seq = self._bytes + size > self._most_bytes, AGAIN
+                if not again:
+                    topic.counts.taken += 1
+                    seq = topic.seq
+                    topic.seq = seq + 1
+                    if full:
+                        self._ledger.drop(topic, MEMORY, ring_us)
+                if full:
                     return
                 self._bytes += size
-                self._queue.append((topic, seq, ring_us, t_us, payload, size))
+                self._queue.append((topic, seq, ring_us, t_us, payload, latched_by, size))
                 hurry = self._bytes > self._hurry_bytes
             if hurry:
                 self._kick.set()
@@ -172,8 +186,7 @@ class Ring:
 
     def since_us(self) -> int:
         """The earliest time that the ring still has: what was before is evicted, or was before the ring."""
-        segments = self._folder.segments()
-        return segments[0].from_us if segments else max(self._began_us, self._folder.evicted_us)
+        return self._folder.since_us(self._began_us)
 
     @property
     def evicted_why(self) -> str:
@@ -217,6 +230,10 @@ class Ring:
                         continue
                 yield message
 
+    def latched(self, at_us: int, wanted: Iterable[str] | None = None) -> Latched:
+        """The latched messages that are in force at a time, also of before the ring's begin."""
+        return self._latched.in_force(at_us, wanted)
+
     def drops(self, from_us: int, to_us: int) -> Sequence[Drop]:
         """What was heard in the window and is not in the ring, as far as known; also of runs before. After
         a restart, a drop of every stream says from when to when nothing was heard."""
@@ -242,6 +259,8 @@ class Ring:
             "written_mb": round(self._writer.written_bytes / 1e6, 1),
             "syncs": self._writer.syncs,
             "dropped": counts.dropped,
+            "latched_mb": round(self._latched.size / 1e6, 1),
+            "latched_dropped": self._latched.dropped,
             "evicted_for": self.evicted_why,
             **self._throttled.counts(),
         }
@@ -283,10 +302,10 @@ class Ring:
             left -= len(items)
             try:
                 for item in items:
-                    self._writer.put(*item[:5])
+                    self._writer.put(item[:5], item[5])
             finally:
                 with self._ledger.lock:
-                    self._bytes -= sum(item[5] for item in items)
+                    self._bytes -= sum(item[6] for item in items)
         self._writer.tick(self.now_us(), flush=bool(flushes), ending=ending)
         now = self._clock.monotonic()
         if ending or now - self._told_at >= _TELL_S:

@@ -16,14 +16,15 @@ from typing import Any, Iterator, Mapping, NamedTuple
 
 from iort_agent.errors import AgentError
 from iort_agent.recorder.config import LZ4, NONE, ZSTD
+from iort_contract.messages.recorder import CHANNEL_STREAM
 from iort_contract.ros.message import RosType
 
 _log = logging.getLogger(__name__)
 
 LIBRARY = "iort-agent"
 JSON = "json"
-# The keys of a channel's metadata that are the ring's own.
-_STREAM, _RUN = "iort_stream", "iort_run"
+# The key of a channel's metadata that is the ring's own.
+_RUN = "iort_run"
 # A chunk is closed by the ring, after a time or some bytes; never by the library.
 _NEVER = 2**62
 _MOST_NS = 2**63 - 1
@@ -79,7 +80,7 @@ def require_mcap() -> None:
 
 def ros_channel(stream: str, kind: RosType, run: str) -> RingChannel:
     """The channel of a ROS topic's messages."""
-    metadata = {_STREAM: stream, _RUN: run}
+    metadata = {CHANNEL_STREAM: stream, _RUN: run}
     if kind.ros2:
         metadata.update(topic_type_hash=kind.md5sum, offered_qos_profiles="")
     else:
@@ -96,7 +97,7 @@ def json_channel(stream: str, values: Mapping[str, Any], run: str) -> RingChanne
         "title": stream,
         "properties": {name: _schema_of(value) for name, value in values.items()},
     }
-    metadata = {_STREAM: stream, _RUN: run}
+    metadata = {CHANNEL_STREAM: stream, _RUN: run}
     definition = json.dumps(schema).encode()
     return RingChannel(stream, stream, JSON, f"iort.{stream}", "jsonschema", definition, metadata, run)
 
@@ -281,7 +282,7 @@ def read_segment(
 
 def _channel(channel: Any, schema: Any) -> RingChannel:
     metadata = dict(channel.metadata)
-    stream, run = metadata.get(_STREAM, channel.topic), metadata.get(_RUN, "")
+    stream, run = metadata.get(CHANNEL_STREAM, channel.topic), metadata.get(_RUN, "")
     encodings = channel.message_encoding, schema.name, schema.encoding
     return RingChannel(stream, channel.topic, *encodings, schema.data, metadata, run)
 

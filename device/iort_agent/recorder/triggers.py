@@ -22,6 +22,7 @@ from typing import Any, Callable, Mapping, Tuple
 from iort_agent.common.schema import did_you_mean
 from iort_agent.recorder.plan import MAX_TEXT, Edge, Plan
 from iort_agent.sources import Emit
+from iort_agent.sources.intake import Selected
 from iort_contract.catalog.derived import DERIVED, SOURCES
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.expression import ExpressionError, MismatchError
@@ -208,6 +209,8 @@ class Triggers:
     def note(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
         """Put a sample into the inbox if a trigger needs it."""
         if stream in self._streams:
+            if type(values) is Selected and values.again:
+                return
             if len(self._inbox) >= _MAX_INBOX or self._bytes > _MAX_INBOX_BYTES:
                 self.unseen += 1
                 return

@@ -11,14 +11,17 @@ from typing import Any
 from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.threads import Clock
 from iort_agent.recorder.folder import SEGMENT_BYTES, SEGMENT_S, RingFolder
+from iort_agent.recorder.latched import LatchedFolder
 from iort_agent.recorder.ledger import DISK, ERROR, Entry, Ledger, Topic
-from iort_agent.recorder.segment import SegmentFile, json_channel, json_message, ros_channel
+from iort_agent.recorder.segment import RingMessage, SegmentFile, json_channel, json_message, ros_channel
 
 _log = logging.getLogger(__name__)
 
 # A chunk is closed after this time or these bytes.
 CHUNK_S, CHUNK_BYTES = 0.3, 1024 * 1024
 _BOUNDS_S = 1.0
+# The number of a latched message that came again: it is not a new one.
+AGAIN = -1
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -29,8 +32,17 @@ class RingWriter:
     it. If that does not help, it is dropped, and so is what follows until the disk works again.
     """
 
-    def __init__(self, folder: RingFolder, ledger: Ledger, clock: Clock, *, run: str, sync_s: float) -> None:
-        self._folder, self._ledger, self._clock = folder, ledger, clock
+    def __init__(
+        self,
+        folder: RingFolder,
+        ledger: Ledger,
+        clock: Clock,
+        *,
+        run: str,
+        sync_s: float,
+        latched: LatchedFolder,
+    ) -> None:
+        self._folder, self._ledger, self._clock, self._latched = folder, ledger, clock, latched
         self._run, self._sync_s = run, sync_s
         self._throttled = ThrottledLog(_log, clock)
         self.file: SegmentFile | None = None
@@ -45,17 +57,23 @@ class RingWriter:
         # While the disk is full or fails, until the next look at it.
         self._stopped = False
 
-    def put(self, topic: Topic, seq: int, ring_us: int, t_us: int, payload: Any) -> None:
+    def put(self, entry: tuple[Topic, int, int, int, Any], latched_by: str | None) -> None:
         """Add a message to the open chunk: its bytes, or a sample."""
-        if self._stopped:
-            with self._ledger.lock:
-                self._ledger.drop(topic, DISK, ring_us)
-            return
+        topic, seq, ring_us, t_us, payload = entry
         if topic.channel is None:
             if topic.kind is None:
                 topic.channel = json_channel(topic.stream, payload, self._run)
             else:
                 topic.channel = ros_channel(topic.stream, topic.kind, self._run)
+        if latched_by is not None:
+            message = RingMessage(topic.channel, max(0, seq), ring_us, t_us, payload)
+            self._latched.put(message, latched_by, again=seq == AGAIN)
+            if seq == AGAIN:
+                return
+        if self._stopped:
+            with self._ledger.lock:
+                self._ledger.drop(topic, DISK, ring_us)
+            return
         if topic.kind is None:
             payload = json_message(payload)
         if not self._chunk:
@@ -77,6 +95,10 @@ class RingWriter:
             self._close_chunk()
         if ending or now - self._file_at >= SEGMENT_S:
             self._end_segment()
+        if not self._stopped:
+            since_us = self._folder.since_us(now_us if self.file is None else self.file.from_us)
+            self._unsynced += self._latched.tick(now_us, since_us, flush=flush or ending)
+            self._folder.beside_bytes = self._latched.size
         if now - self._bounds_at >= _BOUNDS_S:
             self._bounds_at = now
             self._keep_bounds(now_us)
@@ -188,6 +210,7 @@ class RingWriter:
             return
         self._stopped = lacking > 0
         if lacking:
+            self._latched.give_way(now_us)
             self._stop(
                 f"the disk is full: the ring keeps nothing until {lacking / 1e6:.0f} MB more are free "
                 f"({self._folder.path})"

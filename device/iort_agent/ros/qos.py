@@ -43,21 +43,27 @@ class QosConfig:
 
 
 class Request(NamedTuple):
-    """What a subscription requests, and how many messages the middleware keeps for it."""
+    """What a subscription requests, and how many messages the middleware keeps for it. Those of a ``patient``
+    one may wait there a moment: they are taken together."""
 
     offer: Offer
     depth: int
+    patient: bool = False
 
 
-def request(offers: Sequence[Offer], config: QosConfig = QosConfig(), *, large: bool = False) -> Request:
-    """The request to a topic's publishers, whose messages may be ``large``."""
+def request(
+    offers: Sequence[Offer], config: QosConfig = QosConfig(), *, large: bool = False, patient: bool = False
+) -> Request:
+    """The request to a topic's publishers, whose messages may be ``large``. It is ``patient`` only where the
+    middleware has room for what comes meanwhile."""
     reliable = bool(offers) and all(offer.reliable for offer in offers)
     transient_local = bool(offers) and all(offer.transient_local for offer in offers)
     if config.reliability is not None:
         reliable = config.reliability == RELIABLE
     if config.durability is not None:
         transient_local = config.durability == TRANSIENT_LOCAL
-    return Request(Offer(reliable, transient_local), config.depth or (DEPTH_OF_LARGE if large else DEPTH))
+    depth = config.depth or (DEPTH_OF_LARGE if large else DEPTH)
+    return Request(Offer(reliable, transient_local), depth, patient and depth >= DEPTH)
 
 
 def fits(asked: Offer, offer: Offer) -> bool:

@@ -141,9 +141,11 @@ class Node:
         if take is not None:
             self.ignore(topic, take)
 
-    def listen(self, topic: str, taker: OnMessage, qos: QosConfig | None = None) -> None:
+    def listen(
+        self, topic: str, taker: OnMessage, qos: QosConfig | None = None, *, patient: bool = False
+    ) -> None:
         """Receive a topic's messages as `subscribe`, each with the time at which it was published; with
-        ``qos``, by that quality of service."""
+        ``qos``, by that quality of service. For a ``patient`` taker they may come a moment later."""
         name = self.resolve(topic)
         with self._lock:
             if name not in self._wanted:
@@ -151,6 +153,8 @@ class Node:
             wanted = self._wanted[name]
             wanted.qos = qos or wanted.qos
             wanted.takers = (*wanted.takers, taker)
+            if patient:
+                wanted.patient |= {taker}
         self._change()
 
     def ignore(self, topic: str, taker: OnMessage) -> None:

@@ -84,6 +84,8 @@ class Topic:
         self.name = name
         self.qos = QosConfig()
         self.takers: tuple[OnMessage, ...] = ()
+        # Those of them for which messages may come a moment later.
+        self.patient: frozenset[OnMessage] = frozenset()
         # Why one of its types is not heard.
         self.why: str | None = None
         self._session, self._types = session, types
@@ -148,7 +150,8 @@ class Topic:
         part = self._parts.get(kind)
         if part is None:
             part = self._parts[kind] = _Part(kind)
-        asked = request([one.offer for one in endpoints], self.qos, large=large)
+        patient = self.patient.issuperset(self.takers)
+        asked = request([one.offer for one in endpoints], self.qos, large=large, patient=patient)
         if part.now is None:
             part.asked = asked
             part.now = self._subscribe(part)

@@ -27,6 +27,8 @@ _log = logging.getLogger(__name__)
 _AT_ONCE = 64
 # Messages that come closer together are fetched together a little later: waking costs more than they do.
 _BUSY_S, _PAUSE_S = 0.002, 0.004
+# Messages for which nobody waits are fetched so seldom.
+_REST_S = 0.05
 # How long each of several executors waits in turn.
 _TURN_S = 0.01
 _PIECES = (
@@ -106,6 +108,7 @@ class RclpySession:
     ) -> Subscription:
         member, profile = self._member(topic, message_class), self._profile(request)
         subscription = _Subscription(self, member, topic, (message_class, profile), take=take, told=told)
+        subscription.patient = request.patient
         self.subscriptions.append(subscription)
         self.waiter.change()
         return subscription
@@ -181,6 +184,7 @@ class _Subscription:
     ) -> None:
         self.take, (self.message_class, profile) = take, kind
         self._session, self._member, self._topic = session, member, topic
+        self.patient = False
         watched: dict[str, Callable[[Any], None]] = {
             event: _teller(told, reason) for event, reason in _WATCHED.items()
         }
@@ -210,6 +214,10 @@ class _Subscription:
             taken = take_message(message_class, True)
             if taken is None:
                 return True
+            if self.patient and not taken[1].get("received_timestamp"):
+                # This middleware does not tell when a message came: the agent's clock must.
+                self.patient = False
+                self._session.waiter.change()
             take(*taken)
         return False
 
@@ -292,13 +300,16 @@ class _Service:
 
 
 class _WaitSet:
-    """One wait set over all subscriptions and services, filled again for each wait as rcl wants it. The
-    events of subscriptions are rare, and have one of their own that never waits."""
+    """One wait set over all subscriptions and services, filled again for each wait as rcl wants it. Once the
+    patient subscriptions were taken, the others are waited for alone for a moment. The events of
+    subscriptions are rare, and have a wait set of their own that never waits."""
 
     def __init__(self, session: RclpySession) -> None:
         self._session = session
         self._rclpy = _implementation()
         self._busy = False
+        # Until then, patient subscriptions are not waited for.
+        self._rest_until = 0.0
         self.change()
 
     @staticmethod
@@ -327,8 +338,12 @@ class _WaitSet:
         wait_set = self._set
         wait_set.clear_entities()
         add = wait_set.add_subscription
+        rest_s = self._rest_until - time.monotonic()
+        if rest_s > 0:
+            timeout_s = min(timeout_s, rest_s)
         for one in self._subscriptions.values():
-            add(one.handle)
+            if rest_s <= 0 or not one.patient:
+                add(one.handle)
         for service in self._services.values():
             wait_set.add_service(service.handle)
         wait_set.add_guard_condition(self._session.guard.handle)
@@ -336,13 +351,20 @@ class _WaitSet:
             time.sleep(_PAUSE_S)
         began = time.monotonic()
         wait_set.wait(int(timeout_s * 1e9))
-        self._busy = time.monotonic() - began < _BUSY_S
-        ready = wait_set.get_ready_entities("subscription")
-        for pointer in ready:
+        at_once = time.monotonic() - began < _BUSY_S
+        ready, found = wait_set.get_ready_entities("subscription"), self._subscriptions
+        hasty, rest = False, []
+        for pointer in sorted(ready, key=lambda pointer: found[pointer].patient):
+            if found[pointer].patient:
+                rest.append(found[pointer].take_some())
+                continue
+            hasty = True
             # To ask for a message that is not there takes as long as to take one: several are asked for only
             # where there was one the last time, too.
-            self._subscriptions[pointer].take_some(_AT_ONCE if pointer in self._ready else 1)
-        self._ready = frozenset(ready)
+            found[pointer].take_some(_AT_ONCE if pointer in self._ready else 1)
+        self._busy, self._ready = at_once and hasty, frozenset(ready)
+        if rest and all(rest):
+            self._rest_until = time.monotonic() + _REST_S
         if self._services:
             for pointer in wait_set.get_ready_entities("service"):
                 self._services[pointer].serve()

@@ -64,9 +64,19 @@ class TopicConfig:
 
 class Selected(Dict[str, Any]):
     """The selected fields of a message; ``whole`` is the message, for the event recorder, which takes it also
-    if there are no fields."""
+    if there are no fields. ``again`` marks a latched message that came before, which nobody else takes."""
 
     whole: RosMessage | None = None
+    again = False
+
+
+def _mark(values: Mapping[str, Value], latched_by: str, *, again: bool) -> None:
+    """Note in a message that its publisher latches it."""
+    message = values.whole if isinstance(values, Selected) else values
+    if isinstance(values, Selected):
+        values.again = again
+    if isinstance(message, RosMessage):
+        message.latched_by = latched_by
 
 
 class Kind(NamedTuple):
@@ -158,10 +168,14 @@ class Intake:
         tells that others follow at once. Never raises."""
         if arrival_us is None:
             arrival_us = self._clock.now_us()
-        if header.get("latching") == "1" and self._came_before(header, data, source_ns):
+        latched_by = header.get("callerid", "") if header.get("latching") == "1" else None
+        again = latched_by is not None and self._came_before(header, data, source_ns)
+        if again:
             self.warn("latched_again", "a latched message came again; not sent")
-            return
-        self._messages += 1
+            if not self._whole:
+                return
+        else:
+            self._messages += 1
         # Two publishers of one topic are two threads; almost always there is one.
         with self._lock:
             if header is not self._header:
@@ -176,10 +190,15 @@ class Intake:
             t_ns = stamp_ns(data, ros2=kind.ros2)
             t_us = None if t_ns is None else t_ns // 1000
         whole = kind.whole if kind.decoder is None else None
-        if whole is not None:
-            values: Mapping[str, Value] | None = RosMessage(data, whole, arrival_us=arrival_us)
+        if again:
+            # The recorder may have begun since, and needs what is in force.
+            values: Mapping[str, Value] | None = self._selected({}, kind, data, arrival_us)
+        elif whole is not None:
+            values = RosMessage(data, whole, arrival_us=arrival_us)
         else:
             values = self._sample(kind, data, arrival_us)
+        if latched_by is not None and values is not None:
+            _mark(values, latched_by, again=again)
         if t_us is None or self.sim_time or not -BELIEVABLE_US < t_us - arrival_us < BELIEVABLE_US:
             if time != ARRIVAL:
                 self._warn_of_stamp(t_us, arrival_us)

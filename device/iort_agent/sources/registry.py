@@ -58,6 +58,11 @@ class SourceRun:
         self.failed = False
         self._ended = False
 
+    def without_recorder(self) -> None:
+        """Nobody takes whole messages after all; called before `run`."""
+        if isinstance(self.source, (RosSource, RosbridgeSource)):
+            self.source.whole = False
+
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Run until the source ends, fails or is stopped. Raises what is no `SourceError`, unless the source
         plays a recording: run again, it would give its samples twice."""

@@ -103,7 +103,8 @@ class Ros2Source(RosSource):
         return shared(self._config.node, self._clock)
 
     def listen(self, topic: str, settings: TopicConfig, intake: Intake) -> None:
-        self._node.listen(topic, intake.receive, settings.qos)
+        # Nobody looks at the ring at once.
+        self._node.listen(topic, intake.receive, settings.qos, patient=bool(settings.only))
 
     def ignore(self, topic: str, intake: Intake) -> None:
         self._node.ignore(topic, intake.receive)

@@ -1,5 +1,5 @@
 """The cost model's tables as rows of text, for the command, the README and the bench; with them what a fleet
-needs of AWS' default quotas, and a deployment's own month, whoever drives. Pure."""
+needs of AWS' default quotas, a deployment's own month, whoever drives, and what incidents cost. Pure."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from iort_contract.catalog.metrics import METRICS, metrics_of
 from iort_contract.cloud import IOT, PUBNUB
+from iort_contract.messages.files import PART_BYTES
 from iort_station.cost import model
 from iort_station.cost.model import WRITE, bill, dollars_per_month, pubnub_bill, thesis_bill, total, units
 from iort_station.cost.prices import AS_OF, MONTH_HOURS, PRICES, REGION
@@ -18,6 +19,10 @@ from iort_station.cost.usage import Usage
 SHORTEST_RECONNECT_S = 1.0
 # The table of a robot-hour has no rows below this; the totals include them.
 _LEAST_DOLLARS = 0.00005
+# The samples that tell of an incident, each a batch of its own: opened, uploaded.
+_INCIDENT_SAMPLES = 2
+# Seconds and gigabytes of the function that signs addresses, as of a file of one request.
+_SIGNING_S, _SIGNING_GB = 0.1, 0.25
 
 
 class Need(NamedTuple):
@@ -277,3 +282,27 @@ def facts(usage: Usage) -> dict[str, Any]:
             for n in needs(usage)
         ],
     }
+
+
+def _incident_units(count: int, size: int) -> dict[str, float]:
+    """The units by the price's name of ``count`` incidents of ``size`` bytes in all, stored for a month."""
+    parts = max(count, -(-size // PART_BYTES))
+    return {
+        # The question for addresses and its answer; the samples pass by Basic Ingest.
+        "message": 2.0 * count,
+        "rule": (1.0 + _INCIDENT_SAMPLES) * count,
+        "action": (1.0 + _INCIDENT_SAMPLES) * count,
+        "write": float(_INCIDENT_SAMPLES * count),
+        "invocation": float(count),
+        "compute_arm": _SIGNING_S * _SIGNING_GB * count,
+        # A file of several parts is begun and completed, too.
+        "s3_put": float(parts + 2 * count),
+        "s3_standard": size / 1e9,
+    }
+
+
+def incident_dollars(count: int, size: int) -> tuple[float, float]:
+    """Dollars to upload incidents, and to store their files for a month."""
+    units = _incident_units(count, size)
+    stored = units.pop("s3_standard") * PRICES["s3_standard"].each
+    return sum(amount * PRICES[name].each for name, amount in units.items()), stored

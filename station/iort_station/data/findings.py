@@ -13,7 +13,7 @@ from iort_contract.catalog.car import GROUPS
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.findings_table import FindingsTable
 from iort_contract.limits import ContractError
-from iort_contract.messages.analysis import AnalysedDrive, Estimate, Finding, Note, check_note_id
+from iort_contract.messages.analysis import AnalysedDrive, Estimate, Finding, Note, check_note, check_note_id
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import recorder, registry
@@ -85,18 +85,21 @@ def write_note(
     """Write a note about a registered robot at a time; the default is now. The robot's recorder keeps what is
     ``keep_us`` before that time; nothing for 0.
 
-    Raises `UsageError` for a text that is empty or too long, and for a time that no recorder keeps.
+    Raises `UsageError` for a text that is empty or too long, for a time that no recorder keeps, and if the
+    robot's shadow has no room for what is to be kept. Then nothing is written.
     """
     registry.get(cloud, robot)
     at_us = time.time_ns() // 1000 if t_us is None else t_us
     note = Note(robot, at_us, text.strip(), by, secrets.token_hex(4))
     try:
+        check_note(note)
         taken = recorder.new_take(at_us - keep_us, at_us, by=by, why=note.text) if keep_us else None
-        findings_table(cloud).put_note(note)
     except ContractError as error:
         raise UsageError(f"{error}; nothing is written") from error
+    # First what may be refused: who tries again would write the note twice.
     if taken is not None:
         recorder.send_take(cloud, robot, taken)
+    findings_table(cloud).put_note(note)
     return note
 
 

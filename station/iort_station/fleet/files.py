@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from types_boto3_s3.type_defs import ObjectIdentifierTypeDef
 
 _CHUNK_BYTES = 1024 * 1024
+# What `Ranged` fetches at least.
+_BLOCK_BYTES = 64 * 1024
 # DeleteObjects takes at most so many keys.
 _DELETE_SIZE = 1000
 
@@ -146,6 +149,47 @@ def damage(cloud: Cloud, file: StoredFile, progress: CountProgress = lambda _byt
         if expected not in {None, digest.hexdigest()}
         else ""
     )
+
+
+class Ranged:
+    """A stored file that is read in parts, for libraries that seek: only what is read is fetched, in blocks.
+
+    It fetches at most ``most`` bytes, whatever it is asked for; then it raises `ValueError`.
+    """
+
+    def __init__(self, cloud: Cloud, file: StoredFile, most: int) -> None:
+        self._client, self._bucket, self._file = cloud.client("s3"), _bucket(cloud), file
+        self.most, self._place, self._from, self._block = most, 0, 0, b""
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        begin = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._file.size}[whence]
+        self._place = max(0, begin + offset)
+        return self._place
+
+    def tell(self) -> int:
+        return self._place
+
+    def read(self, size: int = -1) -> bytes:
+        """The next bytes: fewer at the file's end."""
+        left = max(0, self._file.size - self._place)
+        size = left if size < 0 else min(size, left)
+        if not self._from <= self._place <= self._place + size <= self._from + len(self._block):
+            self._fetch(min(left, max(size, _BLOCK_BYTES)))
+        begin = self._place - self._from
+        self._place += size
+        return self._block[begin : begin + size]
+
+    def _fetch(self, size: int) -> None:
+        self.most -= size
+        if self.most < 0:
+            raise ValueError(f"{self._file.key}: there is too much to read")
+        if size:
+            part = f"bytes={self._place}-{self._place + size - 1}"
+            body = self._client.get_object(Bucket=self._bucket, Key=self._file.key, Range=part)["Body"]
+            self._block, self._from = b"".join(_chunks(body, self._file.key)), self._place
 
 
 def content(cloud: Cloud, key: str) -> bytes | None:

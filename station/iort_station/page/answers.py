@@ -40,6 +40,7 @@ def answers(cloud: Cloud, track: Track | None = None) -> dict[str, Callable[[Map
     def minutes(request: Mapping[str, str]) -> int:
         return whole(request, "minutes", 1, 14 * 24 * 60)
 
+    counts, pictures = incidents.Counts(cloud), incidents.Pictures(cloud)
     return {
         "robots": lambda _request: {"robots": registry.presence(cloud)},
         "tags": lambda _request: {"tags": robots.tags(cloud)},
@@ -66,7 +67,8 @@ def answers(cloud: Cloud, track: Track | None = None) -> dict[str, Callable[[Map
         "dry_run": lambda request: triggers.count(cloud, request),
         "notes": lambda request: insights.notes(cloud, request),
         "incidents": lambda request: incidents.incidents(cloud, request),
-        "incident_counts": lambda _request: incidents.counts(cloud),
+        "incident_counts": lambda _request: counts.answer(),
+        "incident_picture": pictures.answer,
         "motion": motion.fleet(cloud).motion,
         "socket": lambda _request: motion.address(cloud, VIEWER),
     }

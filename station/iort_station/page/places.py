@@ -24,6 +24,8 @@ MOST_ANSWERS, ANSWERS_OF_CLIENT, ANSWERS_OF_KIND = 16, 8, 4
 MOST_WAITING, WAIT_S = 32, 30.0
 # A file of a long range takes a gigabyte of memory while it is written. A client has one at a time.
 MOST_DOWNLOADS = 2
+# The same of what takes much memory for a moment.
+MOST_FEW = 2
 # For how many robots something waits at once, and how often it looks.
 _MOST_PENDING, PENDING_OF_CLIENT, _LOOK_S, _LONGEST_LOOK_S = 64, 16, 0.1, 1.0
 
@@ -104,14 +106,15 @@ class Places:
 
 class Work:
     """What a server works on, in a thread for each: in the lanes `READING`, `ACTING` and `WRITING`, and those
-    of ``first`` in a lane for each kind. One event loop uses it."""
+    of ``first`` and of ``few`` in a lane for each kind. One event loop uses it."""
 
-    def __init__(self, first: Iterable[str]) -> None:
+    def __init__(self, first: Iterable[str], few: Iterable[str] = ()) -> None:
         self._lanes = {
             READING: _places(),
             ACTING: _places(),
             WRITING: _places(MOST_DOWNLOADS, 1, 1),
             **{kind: _places(of_client=MOST_ANSWERS, of_kind=MOST_ANSWERS) for kind in first},
+            **{kind: _places(MOST_FEW, 1, 1) for kind in few},
         }
         self._pending = _places(_MOST_PENDING, PENDING_OF_CLIENT, PENDING_OF_CLIENT, waiting=0)
 

@@ -54,6 +54,8 @@ BODY_S, PART_S = 10.0, 60.0
 # They stop and drive robots, or a page cannot begin without them. Each has a lane of its own, so that it
 # waits for nothing but its like.
 FIRST = frozenset({"/stop.json", f"/{DRIVE}.json", "/view.json", "/motion.json", "/socket.json", ADMISSION})
+# They decode what robots have sent.
+FEW = frozenset({"/incident_picture.json"})
 # Invitations that nobody has used yet; a further one ends the oldest.
 _MOST_TOKENS = 64
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
@@ -160,7 +162,7 @@ class PageServer(BackgroundServer):
     async def beside(self) -> AsyncIterator[None]:
         """Give invitations to who serves the page."""
         # A loop that begins again leaves the places of the last one to its threads.
-        self._work = Work(FIRST)
+        self._work = Work(FIRST, FEW)
         if self._invitations is None:
             yield
             return
@@ -198,10 +200,14 @@ class PageServer(BackgroundServer):
         file = self._files.get(path)
         if file is None:
             return self._response(request, packed(TYPES[".txt"], b"404 Not Found\n"), 404)
-        response = self._response(request, file, 200)
+        return self._tagged(request, file)
+
+    def _tagged(self, request: web.BaseRequest, body: Body) -> web.Response:
+        """The body, unless the browser has it already."""
+        response = self._response(request, body, 200)
         # Weak, because the same content may be sent with or without gzip.
-        response.etag = ETag(file.etag, is_weak=True)
-        if any(known.value in {file.etag, "*"} for known in request.if_none_match or ()):
+        response.etag = ETag(body.etag, is_weak=True)
+        if any(known.value in {body.etag, "*"} for known in request.if_none_match or ()):
             response.set_status(304)
             response.body = None
         return response
@@ -223,7 +229,10 @@ class PageServer(BackgroundServer):
                 result = await self._work.until(lambda: outcome(lambda: next(waiting)), lane, client, path)
         except Busy as busy:
             return self._busy(request, busy)
-        return self._response(request, result[1], result[0])
+        status, body = result
+        if lane == READING and status == 200:
+            return self._tagged(request, body)
+        return self._response(request, body, status)
 
     async def _download(self, request: web.BaseRequest, path: str) -> web.StreamResponse:
         parameters, download = dict(request.query), self._downloads[path]

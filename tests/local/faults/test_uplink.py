@@ -17,9 +17,9 @@ import pytest
 from iort_agent.common.threads import SystemClock
 from iort_agent.mqtt import aws, dispatch
 from iort_agent.mqtt.aws import IotCore
-from iort_agent.mqtt.client import Broker
+from iort_agent.mqtt.client import Broker, Network
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.failures import SLOW_SHORTEST_S
+from iort_agent.mqtt.failures import REFUSED, UNSTEADY, Backoff, Pace
 from iort_contract.topics import BROKER, CMD, PING, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
@@ -99,6 +99,36 @@ def test_the_uplink_reconnects_and_resubscribes_after_a_reset(bundle, proxy):
         assert "closed the connection" in (status.last_error or "")
 
 
+class Endless(Backoff):
+    def next_s(self, pace: Pace = UNSTEADY) -> float:
+        return 3600.0
+
+
+class Wifi(Network):
+    """A network that comes when the test says so."""
+
+    def __init__(self) -> None:
+        self.back = threading.Event()
+
+    def close(self) -> None:
+        """It hears no notices."""
+
+    def came(self) -> bool:
+        came = self.back.is_set()
+        self.back.clear()
+        return came
+
+
+def test_a_network_that_comes_back_ends_the_wait(bundle, proxy):
+    wifi = Wifi()
+    with connecting(bundle(), proxy, backoff=Endless(), network=lambda: wifi) as log:
+        log.echo(b"before")
+        proxy.reset()
+        until(lambda: log.connections == [True, False])
+        wifi.back.set()
+        log.echo(b"after")
+
+
 def test_repeated_resets_cause_at_most_one_attempt_a_second(bundle, proxy):
     with connecting(bundle(), proxy):
         proxy.reset_every(0.3)
@@ -163,7 +193,7 @@ def test_a_revoked_certificate_ends_the_connection(embedded, bundle, proxy, capl
 def test_another_robots_name_is_rejected_and_logged_once(bundle, proxy, caplog):
     with connecting(bundle(), proxy, client_id="somebody-else"):
         until(lambda: "does not let it connect" in caplog.text)
-        assert not proxy.wait_attempts(2, 3), f"the next attempt is due after {SLOW_SHORTEST_S} s"
+        assert not proxy.wait_attempts(2, 3), f"the next attempt is due after {REFUSED.shortest_s} s"
     (error,) = [r for r in caplog.records if r.levelno == logging.ERROR]
     assert "not authorized" in error.getMessage()
 

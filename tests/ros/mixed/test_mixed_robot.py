@@ -22,8 +22,7 @@ from typing import Any
 
 import pytest
 
-from iort_agent.errors import AgentError
-from iort_agent.status import SOCKET, fetch
+from iort_agent.status import SOCKET
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from testkit.proxy import PASS, REFUSE, Proxy
@@ -32,7 +31,7 @@ from tests.local.conftest import embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed.compare import Bag, Difference, Recorded, compare, read
 from tests.ros.mixed.robot import NODES, TOPICS
-from tests.ros.process import Process
+from tests.ros.process import Process, settled
 
 pytestmark = pytest.mark.heavy
 
@@ -43,8 +42,6 @@ SECOND_S = 2.0
 # A killed agent loses its open batches, which are one second long, and on a busy machine what it has not yet
 # read: at most so much.
 OPEN_S, LAG_S = 2.5, 8.0
-# The recorder and an agent give no notice when they have written all they received.
-SETTLE_S = 2.0
 
 
 # Topic and node.
@@ -102,22 +99,7 @@ class Mixed:
 
     def settled(self) -> bool:
         """Whether the agent has uploaded all that it received, and receives nothing more."""
-        before = self._received()
-        threading.Event().wait(SETTLE_S)
-        received = self._received()
-        return received is not None and received == before and received[0] == 0
-
-    def _received(self) -> tuple[int, list[int]] | None:
-        """Return the number of queued batches and files, and the samples of each stream; None without an
-        answer.
-        """
-        try:
-            status = fetch(self.bundle.folder / SOCKET)
-        except AgentError:
-            return None
-        waiting = int(status["spool"]["batches"]) + int((status["files"] or {"waiting": 0})["waiting"])
-        streams = status["streams"]
-        return waiting, [streams.get(topic.stream, {}).get("samples", 0) for topic in TOPICS.values()]
+        return settled(self.bundle.folder / SOCKET, [topic.stream for topic in TOPICS.values()])
 
 
 def _connections(publishers: dict[str, Process]) -> Iterator[tuple[Publisher, int, int]]:
@@ -126,7 +108,7 @@ def _connections(publishers: dict[str, Process]) -> Iterator[tuple[Publisher, in
         for line in list(publisher.lines):
             if line.startswith("{"):
                 said = json.loads(line)
-                yield (said["topic"], node), said["n"], said["connections"]
+                yield (said["topic"], node), said["n"], said["subscribers"]
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +142,7 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
             DURATION_S,
             "--seed",
             100 * i,
-            "--sent-log",
+            "--sent",
             mixed.out / f"{node}.sent",
         )
         for i, node in enumerate(NODES)
@@ -201,7 +183,7 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     for node, publisher in publishers.items():
         publisher.until(lambda publisher=publisher: publisher.lines[-1].startswith("sent "), "end")
         for line in (mixed.out / f"{node}.sent").read_text().splitlines():
-            topic, content = line.split(" ")
+            topic, _, content = line.split(" ")
             sent[topic, node].append(base64.b64decode(content))
     until(mixed.settled, within_s=300)
     unheard = _unheard(publishers, before, sent)

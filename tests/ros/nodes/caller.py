@@ -1,7 +1,8 @@
 """A rospy node that asks: ``caller.py NAME QUESTION`` prints each answer as a line of JSON.
 
-An empty line of input calls the service, another one is published as the body on the topic of that name. The
-service's type is std_srvs' if that is installed; otherwise genpy makes it from its text.
+An empty line of input calls the service, another one is published as the body on the topic of that name. With
+``--alone``, nobody answers on a topic. The service's type is std_srvs' if that is installed; otherwise genpy
+makes it from its text.
 """
 
 import hashlib
@@ -32,13 +33,14 @@ def trigger():
 
 
 name, question = sys.argv[1:3]
+alone = "--alone" in sys.argv
 rospy.init_node(name, disable_signals=True)
 answers = rospy.Subscriber(f"/iort/answer/{question}", String, lambda message: say(message.data))
 asking = rospy.Publisher(f"/iort/ask/{question}", String, queue_size=10)
 rospy.wait_for_service(f"/iort/ask/{question}", timeout=120)
 call = rospy.ServiceProxy(f"/iort/ask/{question}", trigger())
 connected = threading.Event()
-while not (asking.get_num_connections() and answers.get_num_connections()):
+while not (asking.get_num_connections() and (alone or answers.get_num_connections())):
     connected.wait(0.01)  # rospy has no event for it
 say("found")
 for line in sys.stdin:

@@ -18,6 +18,8 @@ from mcap.reader import NonSeekingReader, make_reader
 OPEN_US = 1_000_000
 # A message comes so much later than it is sent, at most.
 LATE_US = 1_000_000
+# The topic whose messages are latched: whoever listens later hears the newest.
+LATCHED = "/static"
 
 
 class Sent(NamedTuple):
@@ -38,11 +40,13 @@ def sent(path: Path) -> list[Sent]:
 
 
 class Kept(NamedTuple):
-    """An incident's file: what it says of itself, its account, and the messages' hashes by topic."""
+    """An incident's file: what it says of itself, its account, the messages' hashes by topic, and the hashes
+    of the latched ones before the window."""
 
     about: dict[str, str]
     account: dict[str, dict[str, Any]]
     digests: dict[str, Counter[str]]
+    latched: list[str]
 
     def span(self, which: str = "") -> tuple[int, int]:
         """The window: by the samples' times, or by the ``ring_``'s."""
@@ -52,13 +56,18 @@ class Kept(NamedTuple):
 def kept(path: Path) -> Kept:
     """Read a file by `mcap` for Python."""
     digests: dict[str, Counter[str]] = defaultdict(Counter)
+    latched: list[str] = []
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
-        for _, channel, message in reader.iter_messages():
-            digests[channel.topic][hashlib.sha256(message.data).hexdigest()] += 1
         metadata = {one.name: one.metadata for one in reader.iter_metadata()}
-    account = {topic: json.loads(text) for topic, text in metadata["iort.account"].items()}
-    return Kept(metadata["iort.incident"], account, digests)
+        account = {topic: json.loads(text) for topic, text in metadata["iort.account"].items()}
+        for _, channel, message in reader.iter_messages():
+            digest = hashlib.sha256(message.data).hexdigest()
+            if channel.topic == LATCHED and len(latched) < account[LATCHED].get("latched", 0):
+                latched.append(digest)
+            else:
+                digests[channel.topic][digest] += 1
+    return Kept(metadata["iort.incident"], account, digests, latched)
 
 
 def recovered(ring: Path) -> int:
@@ -77,7 +86,8 @@ def recovered(ring: Path) -> int:
 @dataclass(frozen=True)
 class Window:
     """The account of an incident, in messages: ``dead`` ones were sent when no agent was there, or were in
-    the killed one's open chunk; ``named`` ones are missing by the file's own account."""
+    the killed one's open chunk; ``named`` ones are missing by the file's own account. ``latched`` ones are
+    in force at the begin, and ``unlatched`` ones should be, or should not."""
 
     name: str
     path: Path
@@ -89,12 +99,14 @@ class Window:
     named: int
     extra: int
     why: dict[str, int]
+    latched: int
+    unlatched: int
     bucket_s: float = 0.0
 
     @property
     def unexplained(self) -> int:
         """How many are missing without a cause, or were never published."""
-        return max(0, self.missing - self.dead - self.named) + self.extra
+        return max(0, self.missing - self.dead - self.named) + self.extra + self.unlatched
 
 
 def window(name: str, path: Path, publishers: Sequence[Sequence[Sent]], killed_us: int | None) -> Window:
@@ -107,7 +119,9 @@ def window(name: str, path: Path, publishers: Sequence[Sequence[Sent]], killed_u
     published = missing = dead = extra = 0
     for topic, found in file.digests.items():
         everything = Counter(one.digest for sent_ in publishers for one in sent_ if one.topic == topic)
-        extra += (found - everything).total()
+        # A killed agent may not remember which latched ones it has heard.
+        known = found.keys() - everything.keys()
+        extra += len(known) if topic == LATCHED else (found - everything).total()
         for sent_ in publishers:
             own = [one for one in sent_ if one.topic == topic]
             due = [one for one in own if _due(one, file)]
@@ -124,17 +138,37 @@ def window(name: str, path: Path, publishers: Sequence[Sequence[Sent]], killed_u
         path,
         edges=len(json.loads(file.about["edges"])),
         published=published,
-        kept=sum(map(Counter.total, file.digests.values())),
+        kept=sum(map(Counter.total, file.digests.values())) + len(file.latched),
         missing=missing,
         dead=dead,
         named=why.total(),
         extra=extra,
         why=dict(why),
+        latched=len(file.latched),
+        unlatched=_unlatched(file, publishers),
     )
+
+
+def _unlatched(file: Kept, publishers: Sequence[Sequence[Sent]]) -> int:
+    """How many latched messages were surely in force at the window's begin and are not in the file, or were
+    never published before it."""
+    from_us, _ = file.span("ring_")
+    before = set()
+    due = set()
+    for own in publishers:
+        sent_ = [one for one in own if one.topic == LATCHED]
+        before |= {one.digest for one in sent_ if one.t_us < from_us}
+        # The next one may have come just before the begin.
+        if not any(from_us - LATE_US < one.t_us < from_us for one in sent_):
+            due |= {one.digest for one in [one for one in sent_ if one.t_us < from_us][-1:]}
+    there = {*file.latched}
+    return len(due - there) + len(there - before)
 
 
 def _due(one: Sent, file: Kept) -> bool:
     """Whether a message is of the window: by its stamp, or surely by the time at which it came."""
+    if one.topic == LATCHED and one.n == 0:
+        return False  # nobody listened yet
     (from_us, to_us), (ring_from_us, ring_to_us) = file.span(), file.span("ring_")
     by_stamp = from_us <= one.stamp_us <= to_us
     if by_stamp and ring_from_us - LATE_US <= one.t_us <= ring_to_us + LATE_US:
@@ -165,6 +199,7 @@ def table(windows: Sequence[Window]) -> str:
         "dead",
         "named",
         "extra",
+        "latched",
         "unexplained",
         "in the bucket",
     )
@@ -174,7 +209,7 @@ def table(windows: Sequence[Window]) -> str:
             (
                 one.name,
                 *(f"{n:,}" for n in (one.edges, one.published, one.kept, one.missing, one.dead, one.named)),
-                *(f"{n:,}" for n in (one.extra, one.unexplained)),
+                *(f"{n:,}" for n in (one.extra, one.latched, one.unexplained)),
                 f"{one.bucket_s:.1f} s after it",
             )
             for one in windows

@@ -83,6 +83,8 @@ class Drive:
 
     def _overlapping(self) -> None:
         at_s = self._fire()
+        # This one comes in the window, and is in force from then on.
+        self.robot.publisher.say("latch")
         self._fire(OTHER, rested=True)
         self._collect("two that overlap", at_s)
 

@@ -19,13 +19,13 @@ from local.cloud import EmbeddedCloud
 from testkit.proxy import Proxy
 from testkit.waiting import until
 from tests.ros.process import Process
-from tests.ros.recorder.account import Sent, sent
+from tests.ros.recorder.account import LATCHED, Sent, sent
 
 NODES = Path(__file__).resolve().parents[1] / "nodes"
-TOPICS = ("/small", "/large", "/demand")
+TOPICS = ("/small", "/large", "/demand", LATCHED)
 # The demands that fire.
 ONE, OTHER, OFTEN = 1, 2, 3
-DISK_MB = 400
+DISK_MB = 1000
 WAIT_S = 300.0
 _MEGABYTE = bytes(1_000_000)
 
@@ -55,6 +55,7 @@ class Robot:
             "/small": {"stream": "small", "time": "header", "only": "ring"},
             "/large": {"stream": "large", "time": "header", "only": "ring"},
             "/demand": {"stream": "demand", "time": "header"},
+            LATCHED: {"stream": "static", "time": "header", "only": "ring"},
         }
         self.ring = (disk or graph.folder) / "ring"
         settings = {
@@ -63,7 +64,7 @@ class Robot:
             "files": {"rate_kb_s": 0},
             "sources": [{"type": f"ros{graph.ros}", "topics": topics}],
             "recorder": {
-                "folder": str(self.ring), "keep_free_mb": 0, "max_mb": 150, "max_disk_share": 0.5,
+                "folder": str(self.ring), "keep_free_mb": 0, "max_mb": 400, "max_disk_share": 0.5,
                 "topics": list(TOPICS),
             },
         }  # fmt: skip
@@ -83,7 +84,7 @@ class Robot:
     def start_publisher(self) -> None:
         """Start a publisher, and wait until the agent hears it."""
         name = f"robot{len(self._published)}"
-        flags = ["--ros2"] if self.graph.ros == 2 else []
+        flags = ["--latched", *(["--ros2"] if self.graph.ros == 2 else [])]
         self.publisher = self.graph.module("bench.ros.recorder_publisher", name, self.graph.folder, *flags)
         self._published.append(self.graph.folder / f"{name}.sent")
         self.publisher.until(lambda: "ready" in self.publisher.lines, "subscribers")

@@ -62,6 +62,10 @@ def test_every_window_has_every_message_or_says_why_not(drive: Drive) -> None:
     assert [one for one in drive.windows if one.unexplained or not one.kept] == []
 
 
+def test_every_window_begins_with_the_latched_message(drive: Drive) -> None:
+    assert [one for one in drive.windows if not one.latched] == []
+
+
 def test_windows_that_overlap_are_one_file(drive: Drive) -> None:
     assert {one.name: one.edges for one in drive.windows}["two that overlap"] == 2
 

@@ -1,6 +1,7 @@
 """An rclpy node that asks: ``caller.py NAME QUESTION`` prints each answer as a line of JSON.
 
-An empty line of input calls the service, another one is published as the body on the topic of that name.
+An empty line of input calls the service, another one is published as the body on the topic of that name. With
+``--alone``, nobody answers on a topic.
 """
 
 import json
@@ -15,6 +16,7 @@ from std_srvs.srv import Trigger
 from tests.ros.nodes import say
 
 name, question = sys.argv[1:3]
+alone = "--alone" in sys.argv
 rclpy.init(args=[])
 node = rclpy.create_node(name)
 asked, answered = f"/iort/ask/{question}", f"/iort/answer/{question}"
@@ -27,7 +29,7 @@ spinning = threading.Thread(target=executor.spin)
 spinning.start()
 client.wait_for_service()
 waiting = threading.Event()
-while not (asking.get_subscription_count() and node.count_publishers(answered)):
+while not (asking.get_subscription_count() and (alone or node.count_publishers(answered))):
     waiting.wait(0.01)  # rclpy has no event for it
 say("found")
 for line in sys.stdin:

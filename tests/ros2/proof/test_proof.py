@@ -21,14 +21,14 @@ from typing import Any
 
 import pytest
 
-from iort_agent.errors import AgentError
-from iort_agent.status import SOCKET, fetch
+from iort_agent.status import SOCKET
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from testkit.proxy import PASS, REFUSE, Proxy
 from testkit.ros2 import Ros2
 from testkit.waiting import until
 from tests.local.conftest import embedded, invoke  # noqa: F401 - a fixture
+from tests.ros.process import settled
 from tests.ros2.conftest import Graph
 from tests.ros2.proof import package
 from tests.ros2.proof.account import Account, Contents, Kill, Publisher, Row, Sent, bag, exported, table
@@ -38,8 +38,6 @@ pytestmark = pytest.mark.heavy
 
 DURATION_S = float(os.environ.get("IORT_ROS2_S") or 20)
 OUTAGE_S = max(5.0, DURATION_S / 5)
-# The recorder and an agent give no notice when they have written all they received.
-SETTLE_S = 2.0
 _AGAIN = "rear"
 
 
@@ -120,22 +118,7 @@ class Robot:
 
     def settled(self) -> bool:
         """Whether the agent has uploaded all that it received, and receives nothing more."""
-        before = self._received()
-        threading.Event().wait(SETTLE_S)
-        received = self._received()
-        return received is not None and received == before and received[0] == 0
-
-    def _received(self) -> tuple[int, list[int]] | None:
-        """Return the number of queued batches and files, and the samples of each stream; None without an
-        answer.
-        """
-        try:
-            status = fetch(self.bundle.folder / SOCKET)
-        except AgentError:
-            return None
-        waiting = int(status["spool"]["batches"]) + int((status["files"] or {"waiting": 0})["waiting"])
-        streams = status["streams"]
-        return waiting, [streams.get(topic.stream, {}).get("samples", 0) for topic in self.topics.values()]
+        return settled(self.bundle.folder / SOCKET, [topic.stream for topic in self.topics.values()])
 
 
 @pytest.fixture(scope="module")

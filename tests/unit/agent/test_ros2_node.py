@@ -69,13 +69,34 @@ def test_the_request_is_the_most_that_all_publishers_offer(
     offers: list[Offer], config: dict[str, Any], asked: Offer
 ) -> None:
     found = request(offers, QosConfig(**config))
-    assert found == (asked, DEPTH)
+    assert found == (asked, DEPTH, False)
     assert config or all(fits(found.offer, offer) for offer in offers)
 
 
 def test_the_depth_is_that_of_the_settings_and_small_for_large_messages() -> None:
     assert request([RELIABLE], large=True).depth == DEPTH_OF_LARGE
     assert request([RELIABLE], QosConfig(depth=7), large=True).depth == 7
+
+
+def test_a_request_is_patient_only_where_the_middleware_has_room_for_what_comes_meanwhile() -> None:
+    assert request([RELIABLE], patient=True).patient
+    assert not request([RELIABLE], large=True, patient=True).patient
+    assert not request([RELIABLE], QosConfig(depth=7), patient=True).patient
+
+
+def test_a_topic_is_patient_until_somebody_wants_its_messages_at_once() -> None:
+    desk = Desk()
+    ring, bodies = desk.topic.takers, list[bytes]()
+    desk.topic.patient = frozenset(ring)
+    publisher = desk.graph.publisher("/t", IMU)
+    desk.look()
+    assert [one.request.patient for one in desk.graph.subscriptions] == [True]
+    desk.topic.takers = (*ring, lambda _header, data, *_times: bodies.append(data))
+    for n in range(20):
+        publisher.publish(CDR + bytes([n]))
+        desk.look()
+    assert [one.request.patient for one in desk.graph.subscriptions] == [False]
+    assert desk.bodies() == bodies == [CDR + bytes([n]) for n in range(20)]
 
 
 def test_a_topic_is_heard_once_somebody_publishes_it() -> None:
@@ -92,7 +113,7 @@ def test_a_topic_is_heard_once_somebody_publishes_it() -> None:
         "type": IMU, "md5sum": f"sha256_{IMU}", "message_definition": TEXTS[IMU], "callerid": "/driver",
         "latching": "0",
     }  # fmt: skip
-    assert desk.graph.subscriptions[0].request == (RELIABLE, DEPTH)
+    assert desk.graph.subscriptions[0].request == (RELIABLE, DEPTH, False)
     assert desk.topic.report() == {"qos": "reliable, volatile"}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import datetime as dt
 import logging
+import socket
 import sys
 import threading
 import time
@@ -35,7 +36,7 @@ from iort_agent.errors import AgentError
 from iort_agent.files.folder import FilesConfig
 from iort_agent.lanes import PingConfig
 from iort_agent.mqtt.aws import IotCore
-from iort_agent.mqtt.client import Broker
+from iort_agent.mqtt.client import Broker, Network
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.recorder.config import RecorderConfig
 from iort_agent.ros import ros2_node as ros2_module
@@ -232,13 +233,15 @@ def uplink(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> None:
     clock = Trap(kind)
     # Nothing listens at port 9 of this machine.
     broker = Broker("127.0.0.1", 9, "car1", **files)
-    connection = IotCore(broker, clock=clock, dispatcher=Dispatcher())
-    connection.start()
-    try:
-        assert clock.back.wait(SOON_S)
-        assert alarms(kind)[0].endswith(WHY)
-    finally:
-        connection.stop(SOON_S)
+    kernel, notices = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    connection = IotCore(broker, clock=clock, dispatcher=Dispatcher(), network=lambda: Network(notices))
+    with kernel:
+        connection.start()
+        try:
+            assert clock.back.wait(SOON_S)
+            assert alarms(kind)[0].endswith(WHY)
+        finally:
+            connection.stop(SOON_S)
 
 
 Scenario = Callable[[str, Path, pytest.MonkeyPatch], None]

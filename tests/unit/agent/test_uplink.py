@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import random
+import socket
+import struct
 from concurrent.futures import Future
+from contextlib import closing
 from types import SimpleNamespace
 from typing import Any, Callable
 
@@ -13,15 +16,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_agent.identity import Validity
+from iort_agent.mqtt.client import Network
 from iort_agent.mqtt.dispatch import Dispatcher, Subscriptions
-from iort_agent.mqtt.failures import HANGUPS, Backoff, Cause, Causes, Hangups, why_not_connected
+from iort_agent.mqtt.failures import (
+    DOUBTFUL,
+    HANGUPS,
+    REFUSED,
+    UNREACHED,
+    UNSTEADY,
+    Backoff,
+    Cause,
+    Causes,
+    Hangups,
+    Pace,
+    why_not_connected,
+)
 
 NOW_S = 1_700_000_000
 GOOD = Validity(not_before_s=NOW_S - 10, not_after_s=NOW_S + 10)
-REFUSED = mqtt5.ConnectReasonCode.NOT_AUTHORIZED
+LATE = GOOD._replace(not_after_s=NOW_S - 1)
+UNAUTHORIZED = mqtt5.ConnectReasonCode.NOT_AUTHORIZED
 HUNG_UP, CLOSED = "AWS_ERROR_MQTT_UNEXPECTED_HANGUP", "AWS_IO_SOCKET_CLOSED"
 TLS_FAILED = "AWS_IO_TLS_ERROR_NEGOTIATION_FAILURE"
-DNS = "AWS_IO_DNS_INVALID_NAME"
+DNS, NO_NETWORK = "AWS_IO_DNS_INVALID_NAME", "AWS_IO_SOCKET_NO_ROUTE_TO_HOST"
 
 
 def failed(name: str = HUNG_UP, code: Any = None) -> Any:
@@ -32,20 +49,27 @@ def failed(name: str = HUNG_UP, code: Any = None) -> Any:
 @pytest.mark.parametrize(
     ("data", "validity", "again", "expected", "words"),
     [
-        (failed(DNS), GOOD, False, (f"the endpoint's name does not resolve ({DNS})", False), "resolve"),
-        (failed(HUNG_UP), GOOD, False, ("", False), "closed the connection"),
-        (failed(HUNG_UP), GOOD, True, (f"hangup {HUNG_UP}", True), "unknown, inactive or revoked"),
-        (failed(CLOSED), GOOD, True, (f"hangup {CLOSED}", False), "again and again"),
-        (failed(code=REFUSED), GOOD, False, ("refused", True), "not attached to a thing named car7"),
-        (failed(HUNG_UP), GOOD._replace(not_after_s=NOW_S - 1), False, ("validity", True), "expired on 2023"),
-        (failed(code=REFUSED), GOOD._replace(not_before_s=NOW_S + 1), True, ("validity", True), "the clock"),
+        (failed(DNS), GOOD, False, (f"the endpoint's name does not resolve ({DNS})", UNREACHED), "resolve"),
+        (failed(NO_NETWORK), GOOD, False, ("", UNREACHED), "there is no network"),
+        (failed(HUNG_UP), GOOD, False, ("", UNSTEADY), "closed the connection"),
+        (failed(HUNG_UP), GOOD, True, (f"hangup {HUNG_UP}", DOUBTFUL), "unknown, inactive or revoked"),
+        (failed(CLOSED), GOOD, True, (f"hangup {CLOSED}", UNSTEADY), "again and again"),
+        (failed(code=UNAUTHORIZED), GOOD, False, ("refused", REFUSED), "not attached to a thing named car7"),
+        (failed(HUNG_UP), LATE, False, ("validity", REFUSED), "expired on 2023"),
+        (
+            failed(code=UNAUTHORIZED),
+            GOOD._replace(not_before_s=NOW_S + 1),
+            True,
+            ("validity", REFUSED),
+            "the clock",
+        ),
         # The certificate cannot be the reason, so it is not read.
-        (failed(DNS), GOOD._replace(not_after_s=NOW_S - 1), True, ("", False), "resolve"),
-        (failed(code=REFUSED), None, False, ("refused", True), "iort-agent check"),
+        (failed(DNS), LATE, True, ("", UNREACHED), "resolve"),
+        (failed(code=UNAUTHORIZED), None, False, ("refused", REFUSED), "iort-agent check"),
     ],
 )
 def test_each_failure_has_its_cause(
-    data: Any, validity: Validity | None, again: bool, expected: tuple[str, bool], words: str
+    data: Any, validity: Validity | None, again: bool, expected: tuple[str, Pace], words: str
 ) -> None:
     cause = why_not_connected(
         data,
@@ -55,8 +79,8 @@ def test_each_failure_has_its_cause(
         hung_up=lambda before_tls: Hangups(again, again and not before_tls),
     )
     assert words in cause.text
-    kind, slow = expected
-    assert cause.slow is slow
+    kind, pace = expected
+    assert cause.pace == pace
     assert not kind or cause[0] == kind
 
 
@@ -73,7 +97,7 @@ def test_resets_before_tls_and_while_it_begins_are_one_cause_that_is_told_twice(
             hung_up=causes.hung_up,
         )
 
-    told = [(causes.is_news(cause), cause.slow) for cause in map(found, (CLOSED, TLS_FAILED) * 3)]
+    told = [(causes.is_news(cause), cause.pace.person) for cause in map(found, (CLOSED, TLS_FAILED) * 3)]
     assert told == [(True, False), (False, False), (True, False), *[(False, False)] * 3]
 
 
@@ -87,22 +111,52 @@ class Most(random.Random):
         return 1.0
 
 
-@given(st.lists(st.booleans(), max_size=40), st.integers())
-def test_never_below_a_second_nor_above_the_cap(slow: list[bool], seed: int) -> None:
+@given(st.lists(st.sampled_from([UNREACHED, UNSTEADY, DOUBTFUL, REFUSED]), max_size=40), st.integers())
+def test_never_below_the_shortest_wait_nor_above_the_longest(paces: list[Pace], seed: int) -> None:
     backoff = Backoff(random.Random(seed))
-    for one in slow:
-        low, high = (60, 300) if one else (1, 30)
-        assert low <= backoff.next_s(slow=one) <= high
+    for pace in paces:
+        assert pace.shortest_s <= backoff.next_s(pace) <= pace.longest_s
 
 
 def test_the_ceiling_doubles_and_the_first_wait_is_jittered_too() -> None:
     backoff = Backoff(Most())
     assert [backoff.next_s() for _ in range(6)] == [2, 4, 8, 16, 30, 30]
-    assert [backoff.next_s(slow=True) for _ in range(4)] == [120, 240, 300, 300]
+    assert [backoff.next_s(REFUSED) for _ in range(4)] == [120, 240, 300, 300]
+    assert [backoff.next_s(DOUBTFUL) for _ in range(5)] == [10, 20, 40, 60, 60]
+    assert [backoff.next_s(UNREACHED) for _ in range(4)] == [2, 4, 5, 5]
     backoff.reset()
-    assert backoff.next_s(slow=True) == 120
+    assert backoff.next_s(UNREACHED) == 2
     assert backoff.next_s() == 2, "another kind of cause begins anew"
     assert [Backoff(Least()).next_s() for _ in range(3)] == [1, 1, 1]
+
+
+ADDRESS, ADDRESS_GONE, ROUTE, ROUTE_GONE = 20, 21, 24, 25
+
+
+def notice(kind: int, size: int = 24) -> bytes:
+    return struct.pack("=IHHII", size, kind, 0, 0, 0).ljust(size, b"\0")
+
+
+@pytest.mark.parametrize(
+    ("notices", "came"),
+    [
+        ([], False),
+        ([notice(ADDRESS)], True),
+        ([notice(ROUTE)], True),
+        ([notice(ADDRESS_GONE), notice(ROUTE_GONE)], False),
+        ([notice(ROUTE_GONE, 28) + notice(ROUTE)], True),
+        # What is no message of netlink ends, and tells of nothing.
+        ([bytes(40), b"short"], False),
+    ],
+)
+def test_a_network_has_come_with_an_address_or_a_route(notices: list[bytes], came: bool) -> None:
+    kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ours.setblocking(False)
+    with kernel, closing(Network(ours)) as network:
+        for data in notices:
+            kernel.send(data)
+        assert network.came() is came
+        assert not network.came()
 
 
 def test_a_cause_is_news_once() -> None:

@@ -163,11 +163,12 @@ def test_the_recorders_section_has_targets_for_processor_bytes_and_loss():
         {recorder.WITH: recorder.Spread(2.0, 3.0, 9), recorder.WITHOUT: recorder.Spread(1.5, 2.0, 9)},
         0,
         16_000_000,
+        0.3,
     )
     section = Section("recorder", "")
     recorder.report(section, [one])
     assert [(ratio.value, ratio.reached) for ratio in section.ratios] == [
-        *((1.5, False), (1.0, True), (0.5, None), (0, True), (1.0, True), (0.001389, None)),
+        *((1.5, False), (1.0, True), (0.5, None), (0.2, None), (0, True), (1.0, True), (0.001389, None)),
     ]
 
 

@@ -301,6 +301,43 @@ def test_it_gives_up_after_three_tries_and_says_why_without_secrets(receiver, aw
         stored(receiver.url, Clock()).deliver(b"{}", "x")
 
 
+def test_a_receiver_that_drips_its_answer_has_one_deadline_for_all_of_it(aws, socket_enabled):
+    """Each byte comes in time, but the answer takes far longer."""
+    hung_up = threading.Event()
+
+    class Dripping(BaseHTTPRequestHandler):
+        def handle(self):
+            self.connection.recv(65_536)
+            self.connection.settimeout(0.05)
+            for byte in b"HTTP/1.1 200 OK\r\nX-Slow: " + b"x" * 60 + b"\r\n\r\n":
+                try:
+                    self.connection.sendall(bytes([byte]))
+                    ended = self.connection.recv(1) == b""
+                except TimeoutError:
+                    continue
+                except OSError:
+                    ended = True
+                if ended:
+                    hung_up.set()
+                    return
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Dripping)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        clock = Clock()
+        stored(f"http://127.0.0.1:{server.server_port}/", clock)
+        webhook = StoredWebhook(
+            webhook_parameter(), plain=True, timeout_s=0.5, clock=clock, pause=clock.pause
+        )
+        webhook.stored()
+        with pytest.raises(WebhookError, match=r"did not answer within 0\.5 s"):
+            webhook.deliver(b"{}", "x", tries=1)
+        assert hung_up.wait(30), "the connection stays open"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
 def test_a_webhook_that_is_stored_later_is_used_at_once_and_a_removed_one_no_more(receiver, aws):
     clock = Clock()
     webhook = StoredWebhook(webhook_parameter(), plain=True, clock=clock, pause=clock.pause)

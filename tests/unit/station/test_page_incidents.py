@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from iort_contract.messages.files import File, file_key
 from iort_contract.messages.recorder import KEPT, LOST, UPLOADED, Incident
 from iort_station.data import findings
+from iort_station.data.pictures import Line, Picture
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet.control import slept
 from iort_station.page import incidents as page
@@ -63,6 +67,65 @@ def test_the_last_days_incidents_are_counted_by_robot(lab):
     assert answers(lab)["incident_counts"]({}) == {"counts": {"car": 2, "van": 1}}
 
 
+class Held:
+    """Counts the questions to a lab's table, and answers them while it ``may``."""
+
+    def __init__(self, lab):
+        self.asked, self.may = 0, threading.Event()
+        self.begun = threading.Event()
+        self.may.set()
+        self._query, lab.table.query = lab.table.query, self.query
+
+    def query(self, **given):
+        self.asked += 1
+        self.begun.set()
+        assert self.may.wait(30)
+        return self._query(**given)
+
+
+def test_they_are_counted_once_for_all_viewers_and_again_after_a_while(lab):
+    now, held = [0.0], Held(lab)
+    counts = page.Counts(lab, clock=lambda: now[0])
+    with ThreadPoolExecutor(8) as viewers:
+        assert list(viewers.map(lambda _: counts.answer(), range(8))) == [{"counts": {}}] * 8
+    once = held.asked
+    # A question a robot.
+    assert 0 < once < 8
+    now_us = time.time_ns() // 1000
+    lab.tell(incident(1, start_us=now_us - 60 * S), now_us - 60 * S)
+    now[0] = page.COUNTED_S - 1
+    assert counts.answer() == {"counts": {}}
+    assert held.asked == once
+    now[0] = page.COUNTED_S
+    assert counts.answer() == {"counts": {"car": 1}}
+
+
+def test_who_asks_while_they_are_counted_gets_the_last_ones(lab):
+    now, held = [0.0], Held(lab)
+    counts = page.Counts(lab, clock=lambda: now[0])
+    assert counts.answer() == {"counts": {}}
+    held.may.clear()
+    held.begun.clear()
+    now_us = time.time_ns() // 1000
+    lab.tell(incident(1, start_us=now_us), now_us)
+    now[0] = page.COUNTED_S
+    with ThreadPoolExecutor(1) as reader:
+        reading = reader.submit(counts.answer)
+        assert held.begun.wait(30)
+        assert counts.answer() == {"counts": {}}
+        held.may.set()
+        assert reading.result() == {"counts": {"car": 1}}
+
+
+def test_a_failure_to_count_is_told_and_not_kept(lab):
+    counts, query = page.Counts(lab), lab.table.query
+    lab.table.query = lambda **_: (_ for _ in ()).throw(StationError("no such right"))
+    with pytest.raises(StationError):
+        counts.answer()
+    lab.table.query = query
+    assert counts.answer() == {"counts": {}}
+
+
 def test_an_uploaded_incident_is_downloaded_and_checked(lab, s3, tmp_path, monkeypatch):
     lab.bucket = s3
     digest = hashlib.sha256(CONTENT).hexdigest()
@@ -80,13 +143,50 @@ def test_an_uploaded_incident_is_downloaded_and_checked(lab, s3, tmp_path, monke
     lab.tell(incident(2, UPLOADED, key=key, bytes=8), START, robot="van")
     with pytest.raises(StationError, match="not in the bucket any more"):
         download({**asked, "robot": "van", "id": "00000002"}, tmp_path)
+    # The size is that of the file, whatever the robot has said of it.
+    lab.tell(incident(3, UPLOADED, key=key, bytes=1), START + S)
+    monkeypatch.setattr(page, "MOST_BYTES", 8)
+    assert download({**asked, "id": "00000003"}, tmp_path) == path
     monkeypatch.setattr(page, "MOST_BYTES", 7)
-    with pytest.raises(StationError, match="over 7 bytes: run `iort incidents get 00000001`"):
-        download(asked, tmp_path)
+    for id_ in ("00000001", "00000003"):
+        with pytest.raises(StationError, match=f"over 7 bytes: run `iort incidents get {id_}`"):
+            download({**asked, "id": id_}, tmp_path)
     s3.delete_object(Bucket=FILES, Key=key)
     monkeypatch.undo()
     with pytest.raises(StationError, match="not in the bucket any more"):
         download(asked, tmp_path)
+
+
+def test_a_picture_is_made_once_and_the_last_ones_are_kept(lab, s3, monkeypatch):
+    lab.bucket = s3
+    made = []
+
+    def make(_cloud, file):
+        made.append(file.key)
+        return Picture(b"jpeg", "/camera", 0.5) if len(made) == 1 else Picture(line=Line("x", [0.0], [1.0]))
+
+    pictures = page.Pictures(lab, make)
+    key = file_key("car", File("brake-1.mcap", "recording", "application/x-mcap", 8, "0" * 64, START))
+    s3.put_object(Bucket=FILES, Key=key, Body=CONTENT)
+    for number in (1, 2, 3):
+        lab.tell(incident(number, UPLOADED, key=key, bytes=8), START)
+    asked = [{"robot": "car", "id": f"{number:08x}", "from_us": str(START)} for number in (1, 2, 3)]
+    nothing = {"jpeg": "", "topic": "", "after_s": 0.0, "field": "", "times_s": [], "values": []}
+    first = {**nothing, "jpeg": base64.b64encode(b"jpeg").decode(), "topic": "/camera", "after_s": 0.5}
+    assert [pictures.answer(asked[0]) for _ in range(3)] == [first] * 3
+    assert made == [key]
+    assert pictures.answer(asked[1]) == {**nothing, "field": "x", "times_s": [0.0], "values": [1.0]}
+    # The one that nobody has asked for longest goes.
+    monkeypatch.setattr(page, "MOST_PICTURES", 2)
+    for each in (asked[0], asked[2], asked[0]):
+        pictures.answer(each)
+    assert len(made) == 3
+    pictures.answer(asked[1])
+    assert len(made) == 4
+    with pytest.raises(StationError, match="car has uploaded no incident 00000009"):
+        pictures.answer({**asked[0], "id": "00000009"})
+    with pytest.raises(StationError, match="van has uploaded no incident"):
+        pictures.answer({**asked[0], "robot": "van"})
 
 
 @pytest.mark.parametrize(

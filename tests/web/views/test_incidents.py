@@ -2,13 +2,33 @@
 
 from __future__ import annotations
 
+import base64
+import re
+
+import pytest
+
 from testkit.waiting import until
 from tests.browser import drawn, show
-from tests.web.lab import NOW_S
+from tests.images import jpeg
+from tests.web.lab import NO_PICTURE, NOW_S, incident
 
 
 def items(page, view):
     return page.locator(f".{view} .incidents-list li")
+
+
+def seen(page):
+    """Bring a car's list into sight."""
+    until(lambda: items(page, "car").count() > 0, "the list")
+    items(page, "car").first.evaluate("(node) => node.scrollIntoView()")
+
+
+def pictured(page):
+    """The picture of the first incident, which is made once somebody sees its place."""
+    seen(page)
+    picture = items(page, "car").first.get_by_role("img")
+    until(lambda: picture.count() == 1, "the picture")
+    return picture
 
 
 def test_incidents_are_listed_in_their_newest_state_and_downloaded(open_page, lab, server, car, tmp_path):
@@ -38,6 +58,59 @@ def test_incidents_are_listed_in_their_newest_state_and_downloaded(open_page, la
     listed.first.get_by_role("link").click()
     page.locator(".history .charts canvas").first.wait_for()
     until(lambda: "hardbrake" in items(page, "history").first.inner_text(), "the incident in the past")
+
+
+def test_an_uploaded_incident_has_a_picture_that_says_what_it_shows(open_page, lab, server, car):
+    page = open_page(server.url + "#/car/car-1", timezone_id="UTC")
+    show(page, car.send())
+    line = pictured(page)
+    name = line.get_attribute("aria-label")
+    assert re.fullmatch(r"hardbrake, .*[0-9:]{8}.*: current_input from .21 to 3 around the edge", name), name
+    assert items(page, "car").get_by_role("img").count() == 1
+    # The edge is a line at its time: in the middle of four seconds.
+    assert float(line.locator(".edge").get_attribute("x1")) == 80
+
+
+def test_the_picture_of_a_camera_is_its_image_at_the_edge(open_page, lab, server, car):
+    small = jpeg(width=160, height=120)
+    about = {**NO_PICTURE, "topic": "/camera/front", "after_s": -0.034}
+    lab.shown = {**about, "jpeg": base64.b64encode(small).decode()}
+    page = open_page(server.url + "#/car/car-1", timezone_id="UTC")
+    show(page, car.send())
+    image = pictured(page)
+    assert image.get_attribute("aria-label").endswith(": /camera/front, 0.03 s before the edge")
+    assert image.evaluate("(canvas) => [canvas.width, canvas.height]") == [160, 120]
+    assert page.get_by_text("/camera/front", exact=True).is_visible()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        (NO_PICTURE, False),
+        # What is no small JPEG is not decoded.
+        ({**NO_PICTURE, "jpeg": base64.b64encode(jpeg(width=300, height=20)).decode()}, False),
+        (NO_PICTURE, True),
+    ],
+)
+def test_what_has_no_picture_leaves_the_list_as_it_is(open_page, lab, server, car, answer):
+    lab.shown, lab.refuses = answer
+    page = open_page(server.url + "#/car/car-1")
+    show(page, car.send())
+    seen(page)
+    until(lambda: lab.pictures, "the question")
+    until(lambda: items(page, "car").locator(".incident-picture").count() == 0, "no picture")
+    assert items(page, "car").count() == 3
+
+
+def test_only_the_pictures_that_are_seen_are_asked_for_one_after_another(open_page, lab, server, car):
+    lab.incidents = [incident(i, "uploaded", bytes=5, messages=1) for i in range(60)]
+    page = open_page(server.url + "#/car/car-1")
+    show(page, car.send())
+    pictured(page)
+    assert f"{59:016x}" not in lab.pictures
+    items(page, "car").last.evaluate("(node) => node.scrollIntoView()")
+    until(lambda: items(page, "car").last.get_by_role("img").count() == 1, "the last picture")
+    assert len(lab.pictures) == len(set(lab.pictures)) < 60
 
 
 def test_the_button_shows_the_cars_answer(open_page, lab, server, car):

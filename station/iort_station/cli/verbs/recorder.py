@@ -204,7 +204,7 @@ def _facts(one: DryRun) -> dict[str, Any]:
 
 
 def _dollars(one: DryRun) -> tuple[float, float]:
-    from iort_station.cost.incidents import incident_dollars  # noqa: PLC0415 - as above
+    from iort_station.cost.report import incident_dollars  # noqa: PLC0415 - as above
 
     return incident_dollars(0 if one.trigger.notify else len(one.windows), one.within_budget)
 

@@ -324,6 +324,16 @@ export interface IncidentsAnswer {
   readonly found: number;
 }
 
+/** Answers ``incident_picture``: what its file shows. ``jpeg``, in base64, is the image of ``topic`` nearest to the edge, ``after_s`` later. Without an image they are empty, and ``field`` has ``values`` at ``times_s`` after the edge; without those, it is empty too. */
+export interface IncidentPicture {
+  readonly jpeg: string;
+  readonly topic: string;
+  readonly after_s: number;
+  readonly field: string;
+  readonly times_s: readonly number[];
+  readonly values: readonly number[];
+}
+
 /** Answers ``incident_counts``: how many incidents of the last day each robot has, if it has any. */
 export interface IncidentCounts {
   readonly counts: Readonly<Record<string, number>>;

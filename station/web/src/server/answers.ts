@@ -34,10 +34,18 @@ export class Latest {
 
 type Parameters = Readonly<Record<string, string>>;
 
-/** Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. */
-export async function ask<T>(name: string, parameters: Parameters, signal?: AbortSignal): Promise<T> {
+/**
+ * Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. The browser may keep what does
+ * not change (`no-cache`: it asks whether it has changed).
+ */
+export async function ask<T>(
+  name: string,
+  parameters: Parameters,
+  signal?: AbortSignal,
+  cache: RequestCache = "no-store",
+): Promise<T> {
   const answer = await laneOf(name).run(
-    async (end) => (await (await get(`${name}.json`, parameters, end)).json()) as T,
+    async (end) => (await (await get(`${name}.json`, parameters, end, cache)).json()) as T,
     signal,
   );
   signal?.throwIfAborted();
@@ -111,9 +119,14 @@ async function downloaded(
   return { content: new Blob(parts), name: named ?? name };
 }
 
-function get(name: string, parameters: Parameters, signal: AbortSignal | undefined): Promise<Response> {
+function get(
+  name: string,
+  parameters: Parameters,
+  signal: AbortSignal | undefined,
+  cache: RequestCache = "no-store",
+): Promise<Response> {
   return answered(`${name}?${new URLSearchParams(parameters).toString()}`, {
-    cache: "no-store",
+    cache,
     ...(signal ? { signal } : {}),
   });
 }

@@ -8,6 +8,7 @@ import { route } from "../base/route";
 import { bytes } from "../live/attachments";
 import { may } from "../server/admission";
 import { act, ask, Latest, words } from "../server/answers";
+import { IncidentPictures } from "./incident_pictures";
 import { save } from "./saving";
 
 /** How much the button keeps, and the box of a note. */
@@ -47,6 +48,7 @@ export class IncidentsPanel {
   private readonly keeps: boolean;
   private readonly loading = new Latest();
   private readonly saving = new Latest();
+  private readonly pictures = new IncidentPictures();
   private robot: string | undefined;
   private range: Range | undefined;
   private drawn = "";
@@ -94,6 +96,9 @@ export class IncidentsPanel {
     window.clearTimeout(this.timer);
     this.loading.stop();
     this.saving.stop();
+    this.pictures.clear();
+    // What has no picture yet asks for it again.
+    this.drawn = "";
   }
 
   private async load(): Promise<void> {
@@ -142,6 +147,7 @@ export class IncidentsPanel {
     // What has not changed keeps the focus on its buttons.
     const drawn = JSON.stringify(newest);
     if (drawn !== this.drawn) {
+      this.pictures.clear();
       const last = newest.length - 1;
       this.list.replaceChildren(...newest.map((incident, i) => this.item(incident, last - i)));
       this.options.shown?.([...newest].reverse());
@@ -157,9 +163,9 @@ export class IncidentsPanel {
     const size = incident.bytes > 0 ? [bytes(incident.bytes), `${number(incident.messages)} messages`] : [];
     const lacks = missing > 0 ? [`${number(missing)} missing`] : [];
     const told = [why, by ? `by ${by}` : ""].filter(Boolean);
-    const item = el(
-      "li",
-      { "data-incident": id, "data-state": state },
+    const about = el(
+      "div",
+      { class: "incident" },
       ...(this.options.shown ? [el("b", { class: "mark" }, letter(place))] : []),
       el("span", { class: "note-text", title: condition }, trigger.split(",").join(", ")),
       el("span", { class: "state" }, STATES[state] ?? state),
@@ -170,14 +176,17 @@ export class IncidentsPanel {
         `, ${[age(to - from), ...size, ...lacks, ...told].join(", ")}`,
       ),
     );
+    const asked = { robot, id, from_us: String(from_us) };
+    const item = el("li", { "data-incident": id, "data-state": state }, about);
     if (state === "uploaded") {
+      item.prepend(this.pictures.of(asked, `${trigger}, ${when(from)}`));
       const note = new Text("note", "span", { role: "status" });
       const load = (): void => {
         note.set("Reading the file …");
-        void save("incident.mcap", { robot, id, from_us: String(from_us) }, note, this.saving);
+        void save("incident.mcap", asked, note, this.saving);
       };
       const label = `Download the incident ${trigger}, ${when(from)}`;
-      item.append(button("Download", load, { "aria-label": label }), note.node);
+      about.append(button("Download", load, { "aria-label": label }), note.node);
     }
     return item;
   }

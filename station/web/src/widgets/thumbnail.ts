@@ -67,15 +67,11 @@ export class Thumbnail {
 
   private async decode(base64: string): Promise<void> {
     this.shown = base64;
-    const jpeg = jpegOf(base64);
-    const bitmap =
-      jpeg && (await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" })).catch(() => undefined));
+    const bitmap = await bitmapOf(base64);
     // A newer one has arrived meanwhile.
     if (this.shown !== base64) return bitmap?.close();
     if (!bitmap) return this.blank("a thumbnail that is no picture");
-    [this.canvas.width, this.canvas.height] = [bitmap.width, bitmap.height];
-    this.canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
-    bitmap.close();
+    draw(this.canvas, bitmap);
     this.canvas.hidden = false;
     this.state.set("");
     setAttribute(
@@ -84,6 +80,19 @@ export class Thumbnail {
       `${this.label}, ${this.canvas.width} by ${this.canvas.height} pixels`,
     );
   }
+}
+
+/** A small JPEG, decoded; undefined for anything else. */
+export async function bitmapOf(base64: string): Promise<ImageBitmap | undefined> {
+  const jpeg = jpegOf(base64);
+  return jpeg && createImageBitmap(new Blob([jpeg], { type: "image/jpeg" })).catch(() => undefined);
+}
+
+/** Give a canvas the picture and its size. */
+export function draw(canvas: HTMLCanvasElement, bitmap: ImageBitmap): void {
+  [canvas.width, canvas.height] = [bitmap.width, bitmap.height];
+  canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
+  bitmap.close();
 }
 
 /** The bytes of a JPEG with a small size in its header; undefined for anything else. */

@@ -12,6 +12,7 @@ from iort_agent.recorder.account import Losses
 from iort_agent.recorder.config import RecorderConfig
 from iort_agent.recorder.folder import Drop
 from iort_agent.recorder.incidents import Incidents
+from iort_agent.recorder.latched import Latched
 from iort_agent.recorder.ledger import fits
 from iort_agent.recorder.plan import Plan
 from iort_agent.recorder.segment import RingChannel, RingMessage
@@ -71,6 +72,10 @@ class FakeRing:
             channel = message.channel
             if from_us <= message.ring_us <= to_us and fits(patterns, channel.topic, channel.stream):
                 yield message
+
+    def latched(self, at_us: int, wanted: Iterable[str] | None) -> Latched:
+        del at_us, wanted
+        return Latched([], frozenset())
 
     def drops(self, from_us: int, to_us: int) -> Sequence[Drop]:
         return [drop for drop in self.dropped if drop.from_us <= to_us and drop.to_us >= from_us]

@@ -455,3 +455,71 @@ def test_what_is_missing_beside_the_window_is_not_missing_in_it(tmp_path: Path) 
     account = json.loads(metadata["iort.account"]["/vesc"])
     assert account["why"] == {"not_in_ring": 3}
     assert account["messages"] == 71 - 3
+
+
+def test_a_window_that_reaches_into_one_that_was_cut_begins_where_that_ended(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, triggers={"hardbrake": {**BRAKE, "cooldown_s": 0.0}})
+    rig.pass_s(10)
+    edge_us = rig.clock.now_us()
+    rig.brake()
+    rig.pass_s(4)
+    rig.cut()
+    rig.brake()
+    rig.pass_s(6)
+    rig.cut()
+    first, second = (path for path in sorted(rig.files.glob("*.mcap"), key=lambda one: one.stat().st_mtime))
+    messages, _ = content(first)
+    later, metadata = content(second)
+    due = in_window(rig.ring, edge_us - 5 * S, rig.told[-1].to_us)
+    assert messages + later == due, "every message once"
+    about = metadata["iort.incident"]
+    assert about["follows"] == rig.told[0].id
+    assert int(about["from_us"]) == int(about["ring_from_us"]) == edge_us + 2 * S + 1
+    last = rig.told[-1]
+    assert (last.from_us, last.why.partition("; ")[2]) == (edge_us + 2 * S + 1, f"follows {rig.told[0].id}")
+    assert (last.messages, last.missing) == (len(later), 0)
+
+
+def test_it_follows_one_that_was_uploaded_and_forgotten_before_a_restart(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, triggers={"hardbrake": {**BRAKE, "cooldown_s": 0.0}})
+    rig.pass_s(10)
+    rig.brake()
+    rig.pass_s(4)
+    rig.cut()
+    rig.upload()
+    rig.clock.advance(2)
+    rig.cut()
+    assert rig.plan.incidents == {}
+    rig = rig.again()
+    rig.brake()
+    rig.pass_s(4)
+    rig.cut()
+    _, metadata = content(only_file(rig))
+    assert metadata["iort.incident"]["follows"] == rig.told[0].id
+
+
+@pytest.mark.parametrize("why", ["topics", "take", "budget"])
+def test_it_is_whole_where_the_other_file_has_not_all_of_it(tmp_path: Path, why: str) -> None:
+    rig = Rig(tmp_path, triggers={"hardbrake": {**BRAKE, "cooldown_s": 0.0}})
+    rig.pass_s(10)
+    first = {**BRAKE, "cooldown_s": 0.0}
+    if why == "topics":
+        first["topics"] = ["/scan", "/vesc"]
+    if why == "budget":
+        first["budget_mb_day"] = 0.000001
+    rig.watch.desire({"hardbrake": first})
+    rig.brake()
+    rig.pass_s(4)
+    rig.cut()
+    for path in rig.files.glob("*.mcap"):
+        path.unlink()
+    rig.watch.desire({"hardbrake": {**BRAKE, "cooldown_s": 0.0}})
+    if why == "take":
+        rig.take(5)
+    else:
+        rig.brake()
+    rig.pass_s(6)
+    rig.cut()
+    messages, metadata = content(only_file(rig))
+    assert metadata["iort.incident"]["follows"] == ""
+    assert len(messages) >= 50

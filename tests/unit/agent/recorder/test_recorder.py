@@ -57,8 +57,10 @@ def cdr(text: str) -> bytes:
 class Bench:
     """A recorder whose threads are this one."""
 
-    def __init__(self, folder: Path, graph: FakeGraph | None = None, **settings: Any) -> None:
-        self.clock = ManualClock(now_us=T0)
+    def __init__(
+        self, folder: Path, graph: FakeGraph | None = None, now_us: int = T0, **settings: Any
+    ) -> None:
+        self.clock = ManualClock(now_us=now_us)
         self.told: list[Incident] = []
         self.connection = Connection(True, 100.0, 1)
         self.graph = graph

@@ -432,7 +432,24 @@ def test_what_does_not_fit_into_memory_is_dropped_and_counted(tmp_path: Path) ->
     desk.ring.close()
 
 
-def test_the_medium_is_synced_every_few_seconds_and_not_for_each_chunk(
+def test_a_power_cut_leaves_every_closed_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    safe: dict[int, int] = {}
+
+    def sync(fd: int) -> None:
+        status = os.fstat(fd)
+        safe[status.st_ino] = status.st_size
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    desk = Desk(tmp_path)
+    for i in range(60):
+        desk.imu(i, 1)
+        desk.pass_s(1)
+        for path in tmp_path.glob("*.mcap"):
+            assert safe.get(path.stat().st_ino, 0) == path.stat().st_size
+    desk.ring.close()
+
+
+def test_the_medium_may_be_synced_every_few_seconds_and_not_for_each_chunk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     syncs = []

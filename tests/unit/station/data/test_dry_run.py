@@ -21,7 +21,7 @@ from iort_contract.messages.recorder import Trigger, encode_trigger
 from iort_contract.ros.message import MessageType
 from iort_contract.triggers import Edge, evaluator_of
 from iort_station.cli.verbs import recorder
-from iort_station.cost.incidents import incident_dollars
+from iort_station.cost.report import incident_dollars
 from iort_station.data.dry_run import dry_run, fits, lines
 from iort_station.errors import StationError, UsageError
 from testkit.agent import ManualClock

@@ -185,3 +185,19 @@ def test_a_note_may_keep_the_messages_before_it(lab, iort, monkeypatch):
     with pytest.raises(StationError):
         findings.write_note(lab, "car1", "x", by="", keep_us=S)
     assert isinstance(iort("note", "car", "--keep", "60s").exception, UsageError)
+
+
+def test_no_note_is_written_if_the_shadow_has_no_room_for_what_it_keeps(lab, iort, monkeypatch):
+    table = Notes()
+    monkeypatch.setattr(findings, "findings_table", lambda _cloud: table)
+    full = {f"t{i}": {"when": "x" * 560} for i in range(7)}
+    lab.states["car"] = {"desired": {"recorder": {"triggers": full}}}
+    refused = iort("note", "car", "hit the wall", "--keep", "60s")
+    assert refused.exit_code != 0
+    assert "its shadow has no more room; nothing is changed" in str(refused.exception)
+    assert (table.notes, lab.takes()) == ([], {})
+    # Once there is room, it is written once.
+    lab.states["car"]["desired"]["recorder"]["triggers"].popitem()
+    again = iort("note", "car", "hit the wall", "--keep", "60s")
+    assert again.exit_code == 0, again.output
+    assert (len(table.notes), len(lab.takes())) == (1, 1)
