@@ -22,6 +22,7 @@ from iort_analysis.samples.blocks import Block, Column, column_of, join, ordered
 from iort_contract.catalog.derived import SOURCES, Vehicle
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, Value
+from iort_contract.messages.recorder import CHANNEL_STREAM
 from iort_contract.ros.definition import short_kind
 from iort_contract.ros.message import MessageType, RosMessage, RosType
 from iort_contract.topics import check_stream
@@ -156,7 +157,7 @@ class Kept:
         if summary is None or summary.statistics is None:
             raise StationError(f"{path.name} is no incident: it has no index")
         self._topics = {
-            channel.metadata.get("iort_stream", channel.topic): channel.topic
+            channel.metadata.get(CHANNEL_STREAM, channel.topic): channel.topic
             for channel in summary.channels.values()
         }
         self.start_us = summary.statistics.message_start_time // 1000
@@ -292,7 +293,7 @@ class Frames:
         if newest is not None:
             _, kind, raw = newest
             if kind.id not in self._decoders:
-                self._decoders[kind.id] = Images(kind)
+                self._decoders[kind.id] = Images(kind.kind, kind.definition)
             try:
                 pixels = self._decoders[kind.id].pixels(raw)
             except StationError:

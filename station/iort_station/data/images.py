@@ -1,9 +1,10 @@
-"""Images of ROS messages as pixels."""
+"""Images of ROS messages as pixels. Their size has a bound: a robot may be anybody's."""
 
 from __future__ import annotations
 
-from io import BytesIO
-from typing import Any, TypeAlias
+import io
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,71 +12,48 @@ from numpy.typing import NDArray
 from iort_contract.limits import ContractError
 from iort_contract.ros.decode import Decoder, Large
 from iort_contract.ros.definition import parse, short_kind
-from iort_contract.ros.message import MessageType
 from iort_station.errors import StationError
 
 # Height, width, and red, green, blue.
 Pixels: TypeAlias = NDArray[np.uint8]
 
 IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
-# A robot chooses the size: a small file may become gigabytes of pixels.
-_MOST_PIXELS = 4096 * 4096
-# The place of red, green and blue in an encoding's pixel of so many bytes: sensor_msgs/image_encodings.hpp.
-_ENCODINGS = {
-    "rgb8": (3, (0, 1, 2)),
-    "8UC3": (3, (2, 1, 0)),
-    "bgr8": (3, (2, 1, 0)),
-    "rgba8": (4, (0, 1, 2)),
-    "bgra8": (4, (2, 1, 0)),
-    "8UC4": (4, (2, 1, 0)),
-    "mono8": (1, (0, 0, 0)),
-    "8UC1": (1, (0, 0, 0)),
-}
-
-
-def is_image(kind: MessageType) -> bool:
-    """Whether messages of a type are images."""
-    return _name(kind) in {IMAGE, COMPRESSED}
+MOST_PIXELS = 20_000_000
 
 
 class Images:
-    """Decodes a topic's messages of one type: CompressedImage, or Image of 8 bits a channel.
+    """Decodes messages of a type of images: CompressedImage with JPEG or PNG, or Image in the encodings of
+    `sensor_msgs/image_encodings.hpp` that `_LAYOUTS` has. ``definition`` is the type's text.
 
-    Raises `StationError` for a type without images.
+    Raises `StationError` for another type.
     """
 
-    def __init__(self, kind: MessageType) -> None:
-        self._compressed = _name(kind) == COMPRESSED
-        if not is_image(kind):
-            raise StationError(f"{kind.topic} must have messages of {IMAGE} or {COMPRESSED}, got {kind.kind}")
+    def __init__(self, kind: str, definition: str) -> None:
+        name = short_kind(kind)
+        if name not in {IMAGE, COMPRESSED}:
+            raise StationError(f"a camera must have messages of {IMAGE} or {COMPRESSED}, got {kind}")
+        self._compressed = name == COMPRESSED
         try:
-            self._decoder = Decoder(parse(kind.kind, kind.definition), large=True)
-        except ContractError as error:
-            raise StationError(f"{kind.topic}: {error}") from error
-
-    def pixels(self, raw: bytes) -> Pixels | None:
-        """A message's pixels; None for one whose content was not kept. Raises `StationError` for a damaged
-        one, and for an unknown encoding."""
-        try:
-            values = self._decoder.decode(raw)
+            self._decoder = Decoder(parse(kind, definition), large=True)
         except ContractError as error:
             raise StationError(str(error)) from error
-        data: Any = values.get("data")
+
+    def pixels(self, raw: bytes, least: int = 0) -> Pixels | None:
+        """A message's pixels; None for one whose content was not kept.
+
+        With ``least``, a large image may lose pixels, but keeps so many on its shorter side. Raises
+        `StationError` for a damaged image, an unknown encoding, and one of more than `MOST_PIXELS`.
+        """
+        try:
+            sample: dict[str, Any] = dict(self._decoder.decode(raw))
+        except ContractError as error:
+            raise StationError(str(error)) from error
+        data = sample.get("data")
         if not isinstance(data, Large):
             raise StationError("the image has no data")
         if not data:
             return None
-        if self._compressed:
-            return _decompressed(data)
-        height, width, step = (int(values[name] or 0) for name in ("height", "width", "step"))
-        encoding = str(values["encoding"])
-        if encoding not in _ENCODINGS:
-            raise StationError(f"an image's encoding must be {', '.join(_ENCODINGS)}, got {encoding!r}")
-        size, places = _ENCODINGS[encoding]
-        if not height or not width or step < width * size or len(data) < height * step:
-            raise StationError(f"an image of {width}x{height} {encoding} has {len(data)} bytes, {step} a row")
-        rows = np.frombuffer(data, dtype=np.uint8, count=height * step).reshape(height, step)
-        return rows[:, : width * size].reshape(height, width, size)[:, :, list(places)]
+        return _decompressed(data, least) if self._compressed else _of_pixels(sample, data, least)
 
 
 def resized(pixels: Pixels, width: int, height: int) -> Pixels:
@@ -86,19 +64,109 @@ def resized(pixels: Pixels, width: int, height: int) -> Pixels:
     return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BILINEAR))
 
 
-def _decompressed(data: bytes) -> Pixels:
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - as above
+def _decompressed(data: bytes, least: int) -> Pixels:
+    from PIL import Image  # noqa: PLC0415 - as above
 
     try:
-        with Image.open(BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
-            if image.width * image.height > _MOST_PIXELS:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+            if image.width * image.height > MOST_PIXELS:
                 raise StationError(
-                    f"an image must have at most {_MOST_PIXELS} pixels, got {image.width}x{image.height}"
+                    f"an image must have at most {MOST_PIXELS} pixels, got {image.width} by {image.height}"
                 )
+            if least:
+                # A JPEG is decoded at a part of its size.
+                image.draft("RGB", (least, least))
             return np.asarray(image.convert("RGB"))
-    except (OSError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise StationError(f"the image is damaged: {error}") from error
 
 
-def _name(kind: MessageType) -> str:
-    return short_kind(kind.kind)
+def _of_pixels(sample: dict[str, Any], data: bytes, least: int) -> Pixels:
+    from PIL import Image  # noqa: PLC0415 - as above
+
+    width, height, step = (int(sample[name]) for name in ("width", "height", "step"))
+    encoding = str(sample["encoding"])
+    layout = _LAYOUTS.get(encoding)
+    if layout is None:
+        raise StationError(f"an image's encoding must be one of {', '.join(_LAYOUTS)}, got {encoding[:20]!r}")
+    kind = np.dtype(layout.kind).newbyteorder(">" if sample["is_bigendian"] else "<")
+    used = width * layout.values * kind.itemsize
+    if not 0 < width * height <= MOST_PIXELS or step < used or len(data) < height * step:
+        raise StationError(f"an image of {width} by {height} {encoding} has {len(data)} bytes, {step} a row")
+    rows = np.frombuffer(data, np.uint8, height * step).reshape(height, step)
+    pixels = rows[:, :used].view(kind).reshape(height, width, layout.values)
+    # An even step keeps a pattern of two by two.
+    part = max(1, min(width, height) // least if least else 1) * layout.cell
+    shown = layout.shown(pixels, part)
+    size = shown.shape[1], shown.shape[0]
+    if not all(size):
+        raise StationError(f"an image of {width} by {height} {encoding} is too small")
+    return np.asarray(Image.frombytes(layout.mode, size, shown.astype(np.uint8).tobytes()).convert("RGB"))
+
+
+class _Layout(NamedTuple):
+    """How an encoding has its pixels: values of a ``kind`` for each. ``shown`` gives some of them in 8 bit as
+    Pillow's ``mode``; a pattern repeats after ``cell`` pixels."""
+
+    values: int
+    shown: Callable[[Any, int], Any]
+    mode: str = "RGB"
+    kind: str = "u1"
+    cell: int = 1
+
+
+def _colours(*order: int) -> Callable[[Any, int], Any]:
+    return lambda pixels, part: pixels[::part, ::part][:, :, list(order)]
+
+
+def _grey(pixels: Any, part: int) -> Any:
+    return pixels[::part, ::part, 0]
+
+
+def _stretched(pixels: Any, part: int) -> Any:
+    """Depths or light of more than 8 bit, from the least to the most."""
+    values = pixels[::part, ::part, 0].astype(np.float32)
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
+    scaled = (np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / max(high - low, 1e-6)
+    return (np.clip(scaled, 0, 1) * 255).astype(np.uint8)
+
+
+def _bayer(pattern: str) -> Callable[[Any, int], Any]:
+    """The colours of each cell of two by two pixels, of which two are green."""
+    places = {colour: divmod(pattern.index(colour), 2) for colour in "rgb"}
+
+    def shown(pixels: Any, part: int) -> Any:
+        height, width = (size // 2 * 2 for size in pixels.shape[:2])
+        whole = pixels[:height, :width, 0]
+        return np.dstack([whole[row::part, column::part] for row, column in places.values()])
+
+    return shown
+
+
+def _yuv(y: int, u: int, v: int) -> Callable[[Any, int], Any]:
+    """Two pixels of four values share their colour; one of the two is shown."""
+
+    def shown(pixels: Any, part: int) -> Any:
+        height, width = pixels.shape[:2]
+        pairs = pixels[:, : width // 2 * 2].reshape(height, width // 2, 4)
+        return pairs[::part, :: part // 2][:, :, [y, u, v]]
+
+    return shown
+
+
+_LAYOUTS = {
+    **dict.fromkeys(("mono8", "8UC1"), _Layout(1, _grey, "L")),
+    **dict.fromkeys(("mono16", "16UC1"), _Layout(1, _stretched, "L", "u2")),
+    "32FC1": _Layout(1, _stretched, "L", "f4"),
+    "rgb8": _Layout(3, _colours(0, 1, 2)),
+    **dict.fromkeys(("bgr8", "8UC3"), _Layout(3, _colours(2, 1, 0))),
+    "rgba8": _Layout(4, _colours(0, 1, 2)),
+    "bgra8": _Layout(4, _colours(2, 1, 0)),
+    **{
+        f"bayer_{pattern}8": _Layout(1, _bayer(pattern), cell=2)
+        for pattern in ("rggb", "bggr", "gbrg", "grbg")
+    },
+    **dict.fromkeys(("uyvy", "yuv422"), _Layout(2, _yuv(1, 0, 2), "YCbCr", cell=2)),
+    **dict.fromkeys(("yuyv", "yuv422_yuy2"), _Layout(2, _yuv(0, 1, 3), "YCbCr", cell=2)),
+}

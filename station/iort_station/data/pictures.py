@@ -28,13 +28,15 @@ from iort_contract.expression import ExpressionError
 from iort_contract.limits import ContractError, MessageError
 from iort_contract.messages.recorder import ABOUT_RECORD, CHANNEL_STREAM
 from iort_contract.ros.decode import Decoder
-from iort_contract.ros.definition import parse
+from iort_contract.ros.definition import parse, short_kind
 from iort_contract.triggers import parse_trigger
 from iort_station.cloud import Cloud
+from iort_station.data.images import COMPRESSED, IMAGE, Images, Pixels
+from iort_station.errors import StationError
 from iort_station.fleet.files import Ranged, StoredFile
 
-# A picture's longest side, and of how many pixels it may be made.
-SIDE, MOST_PIXELS = 160, 20_000_000
+# A picture's longest side.
+SIDE = 160
 # What is fetched of a file: its summary, and all.
 _SUMMARY_BYTES, _MOST_BYTES = 4_000_000, 24_000_000
 _MOST_UNPACKED, _MOST_INDEX = 40_000_000, 2_000_000
@@ -43,11 +45,9 @@ _BEFORE_NS, _AFTER_NS = 15_000_000_000, 15_000_000_000
 _MOST_POINTS, _MOST_CHUNKS = 200, 8
 # The topics that are tried for an image, and for a field.
 _MOST_TOPICS, _MOST_TOPICS_OF_A_FIELD = 3, 50
-_COMPRESSED = {"sensor_msgs/CompressedImage", "sensor_msgs/msg/CompressedImage"}
-_RAW = {"sensor_msgs/Image", "sensor_msgs/msg/Image"}
 # What a wrong file makes the libraries raise.
 _WRONG = (
-    *(McapError, ContractError, MessageError),
+    *(McapError, ContractError, MessageError, StationError),
     *(ValueError, KeyError, IndexError, TypeError, OverflowError, RecursionError, MemoryError),
     *(struct.error, OSError, EOFError, SyntaxError, Warning),
 )
@@ -193,127 +193,29 @@ def _unpacked(compression: str, data: bytes) -> bytes:
 def _image(incident: _Incident, channels: Sequence[tuple[Channel, Schema | None]]) -> Picture | None:
     """The image nearest to the edge; a compressed one before a raw one, which is larger."""
     topics = sorted(
-        (schema.name in _RAW, channel.topic, channel.id, channel, schema)
+        (short_kind(schema.name) == IMAGE, channel.topic, channel.id, channel, schema)
         for channel, schema in channels
-        if schema is not None and schema.name in _COMPRESSED | _RAW
+        if schema is not None and short_kind(schema.name) in {IMAGE, COMPRESSED}
     )
-    for raw, topic, _, channel, schema in topics[:_MOST_TOPICS]:
+    for _, topic, _, channel, schema in topics[:_MOST_TOPICS]:
         with suppress(*_WRONG):
             message = incident.nearest(channel)
             if message is not None:
-                sample = _decoder(schema, large=True).decode(message.data)
-                jpeg = _jpeg_of_raw(sample) if raw else _jpeg(io.BytesIO(cast("bytes", sample["data"])))
-                return Picture(jpeg, topic, (message.log_time - incident.edge_ns) / 1e9)
+                images = Images(schema.name, schema.data.decode("utf-8", "replace"))
+                pixels = images.pixels(message.data, 4 * SIDE)
+                if pixels is not None:
+                    return Picture(_small(pixels), topic, (message.log_time - incident.edge_ns) / 1e9)
     return None
 
 
-def _jpeg(content: IO[bytes]) -> bytes:
-    """A JPEG or PNG, small."""
+def _small(pixels: Pixels) -> bytes:
     from PIL import Image  # noqa: PLC0415 - only pictures need it
 
-    try:
-        with Image.open(content, formats=("JPEG", "PNG")) as image:
-            if image.width * image.height > MOST_PIXELS:
-                raise ValueError("the image is too large")
-            # A JPEG is decoded at a part of its size.
-            image.draft("RGB", (2 * SIDE, 2 * SIDE))
-            return _small(image.convert("RGB"))
-    except Image.DecompressionBombError as error:
-        raise ValueError(str(error)) from error
-
-
-def _small(image: Any) -> bytes:
+    image = Image.fromarray(pixels)
     image.thumbnail((SIDE, SIDE))
     out = io.BytesIO()
     image.save(out, "JPEG", quality=80)
     return out.getvalue()
-
-
-def _jpeg_of_raw(sample: Mapping[str, Any]) -> bytes:
-    """An image as pixels, small."""
-    from PIL import Image  # noqa: PLC0415 - only pictures need it
-
-    width, height, step = (int(sample[name]) for name in ("width", "height", "step"))
-    encoding = str(sample["encoding"])
-    layout = _LAYOUTS.get(encoding)
-    if layout is None or not 0 < width * height <= MOST_PIXELS:
-        raise ValueError(f"an image of {encoding[:20]}, {width} by {height}")
-    kind = np.dtype(layout.kind).newbyteorder(">" if sample["is_bigendian"] else "<")
-    rows = np.frombuffer(sample["data"], np.uint8, height * step).reshape(height, step)
-    pixels = rows[:, : width * layout.values * kind.itemsize].view(kind).reshape(height, width, layout.values)
-    # Of a large image a part of the pixels is enough; an even step keeps a pattern of two by two.
-    part = max(1, min(width, height) // (4 * SIDE)) * layout.cell
-    shown = layout.shown(pixels, part)
-    size = shown.shape[1], shown.shape[0]
-    return _small(Image.frombytes(layout.mode, size, shown.astype(np.uint8).tobytes()).convert("RGB"))
-
-
-class _Layout(NamedTuple):
-    """How an encoding has its pixels: values of a ``kind`` for each. ``shown`` gives some of them in 8 bit as
-    Pillow's ``mode``; a pattern repeats after ``cell`` pixels."""
-
-    values: int
-    shown: Callable[[Any, int], Any]
-    mode: str = "RGB"
-    kind: str = "u1"
-    cell: int = 1
-
-
-def _colours(*order: int) -> Callable[[Any, int], Any]:
-    return lambda pixels, part: pixels[::part, ::part][:, :, list(order)]
-
-
-def _grey(pixels: Any, part: int) -> Any:
-    return pixels[::part, ::part, 0]
-
-
-def _stretched(pixels: Any, part: int) -> Any:
-    """Depths or light of more than 8 bit, from the least to the most."""
-    values = pixels[::part, ::part, 0].astype(np.float32)
-    known = values[np.isfinite(values)]
-    low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
-    scaled = (np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / max(high - low, 1e-6)
-    return (np.clip(scaled, 0, 1) * 255).astype(np.uint8)
-
-
-def _bayer(pattern: str) -> Callable[[Any, int], Any]:
-    """The colours of each cell of two by two pixels, of which two are green."""
-    places = {colour: divmod(pattern.index(colour), 2) for colour in "rgb"}
-
-    def shown(pixels: Any, part: int) -> Any:
-        height, width = (size // 2 * 2 for size in pixels.shape[:2])
-        whole = pixels[:height, :width, 0]
-        return np.dstack([whole[row::part, column::part] for row, column in places.values()])
-
-    return shown
-
-
-def _yuv(y: int, u: int, v: int) -> Callable[[Any, int], Any]:
-    """Two pixels of four values share their colour; one of the two is shown."""
-
-    def shown(pixels: Any, part: int) -> Any:
-        height, width = pixels.shape[:2]
-        pairs = pixels[:, : width // 2 * 2].reshape(height, width // 2, 4)
-        return pairs[::part, :: part // 2][:, :, [y, u, v]]
-
-    return shown
-
-
-_LAYOUTS = {
-    **dict.fromkeys(("mono8", "8UC1"), _Layout(1, _grey, "L")),
-    **dict.fromkeys(("mono16", "16UC1"), _Layout(1, _stretched, "L", "u2")),
-    "32FC1": _Layout(1, _stretched, "L", "f4"),
-    "rgb8": _Layout(3, _colours(0, 1, 2)),
-    **dict.fromkeys(("bgr8", "8UC3"), _Layout(3, _colours(2, 1, 0))),
-    "rgba8": _Layout(4, _colours(0, 1, 2)),
-    "bgra8": _Layout(4, _colours(2, 1, 0)),
-    **{
-        f"bayer_{pattern}8": _Layout(1, _bayer(pattern), cell=2)
-        for pattern in ("rggb", "bggr", "gbrg", "grbg")
-    },
-    **dict.fromkeys(("uyvy", "yuv422"), _Layout(2, _yuv(1, 0, 2), "YCbCr", cell=2)),
-    **dict.fromkeys(("yuyv", "yuv422_yuy2"), _Layout(2, _yuv(0, 1, 3), "YCbCr", cell=2)),
-}
 
 
 # --- lines -------------------------------------------------------------------------------------------

@@ -226,7 +226,7 @@ def raw_image(encoding, data, width=2, height=1, step=None):
     return bytes(ROS1.serialize_ros1(made, RAW))
 
 
-IMAGES = Images(MessageType("raw", "/raw", "sensor_msgs/Image", "", ROS1.generate_msgdef(RAW)[0]))
+IMAGES = Images("sensor_msgs/Image", ROS1.generate_msgdef(RAW)[0])
 
 
 @pytest.mark.parametrize(
@@ -246,8 +246,8 @@ def test_the_encodings_of_images(encoding, data, pixels):
 @pytest.mark.parametrize(
     ("raw", "problem"),
     [
-        (raw_image("16UC1", [0, 0, 0, 0]), "encoding must be rgb8, .*, got '16UC1'"),
-        (raw_image("rgb8", [1, 2, 3]), "an image of 2x1 rgb8 has 3 bytes, 3 a row"),
+        (raw_image("rgb16", [0, 0, 0, 0]), "encoding must be one of mono8, .*, got 'rgb16'"),
+        (raw_image("rgb8", [1, 2, 3]), "an image of 2 by 1 rgb8 has 3 bytes, 3 a row"),
         (raw_image("mono8", [1, 2], height=2**20, step=2), "has 2 bytes"),
         (b"\0", "truncated"),
     ],
