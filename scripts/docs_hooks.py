@@ -1,4 +1,4 @@
-"""mkdocs' hook: the pages link to files of the checkout, which the site does not have."""
+"""mkdocs' hooks: the pages' version, and their links to files of the checkout, which are not in the site."""
 
 from __future__ import annotations
 
@@ -7,6 +7,13 @@ from pathlib import Path
 from typing import Any
 
 _LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|\n)+)\]\(([^)\s#:]+)(?:#[^)\s]*)?\)")
+
+
+def on_config(config: Any) -> Any:
+    """Show below each page for which version it is."""
+    project = (Path(config["docs_dir"]).parent / "contract" / "pyproject.toml").read_text()
+    config["copyright"] = "iort " + re.findall(r'(?m)^version = "(.+)"$', project)[0]
+    return config
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, **_: object) -> str:

@@ -71,10 +71,11 @@ def _value(value: Value) -> Any:
 
 
 class Inquiries:
-    """The tools over a deployment. Every one raises `StationError`."""
+    """The tools over a deployment. Every one raises `StationError`, also for more than ``most_batches`` of a
+    stream."""
 
-    def __init__(self, cloud: Cloud) -> None:
-        self._cloud, self._lab = cloud, Lab(cloud)
+    def __init__(self, cloud: Cloud, *, most_batches: int = MOST_BATCHES) -> None:
+        self._cloud, self._lab, self._most = cloud, Lab(cloud), most_batches
 
     def robots(self) -> Facts:
         """The registered robots, and whether each is connected."""
@@ -142,10 +143,10 @@ class Inquiries:
             where=where,
             every=every,
             most=MOST_VALUES,
-            progress=_bounded(),
+            progress=_bounded(self._most),
         )
         refused = (result.refused, result.reason)
-        word = verdict(self._cloud, robot, stream, start_us, end_us, refused=refused, most=MOST_BATCHES)
+        word = verdict(self._cloud, robot, stream, start_us, end_us, refused=refused, most=self._most)
         command = ["iort", "query", robot, stream, "--from", iso(start_us), "--to", iso(end_us)]
         for option, given in (
             ("--fields", fields and ",".join(fields)),
@@ -196,7 +197,7 @@ class Inquiries:
         elif per == "lap":
             found = []
             for run in laps_of_runs(
-                self._cloud, robot, start_us, end_us, count=MOST_LISTED, progress=_bounded()
+                self._cloud, robot, start_us, end_us, count=MOST_LISTED, progress=_bounded(self._most)
             ):
                 table = run.mined.tables.get(LAPS_TABLE)
                 columns = () if table is None else (table[name].tolist() for name in _OF_A_LAP)
@@ -228,9 +229,7 @@ class Inquiries:
             streams = []
             for name, part in one.streams.items():
                 first_us, last_us = part["from_us"] or 0, part["to_us"] or 0
-                word = verdict(
-                    self._cloud, robot, name, first_us, last_us, refused=(0, ""), most=MOST_BATCHES
-                )
+                word = verdict(self._cloud, robot, name, first_us, last_us, refused=(0, ""), most=self._most)
                 counts = {"samples": part["samples"], "batches": part["batches"]}
                 streams.append(
                     {"stream": said(name), **_between(first_us, last_us), **counts, "audit": _audit(word)}
@@ -256,7 +255,7 @@ class Inquiries:
             word = _no_samples("the finding is of no stream")
             if one.stream:
                 about = (one.drive.robot, one.stream, one.from_us, one.to_us + 1)
-                word = _audit(verdict(self._cloud, *about, refused=(0, ""), most=MOST_BATCHES))
+                word = _audit(verdict(self._cloud, *about, refused=(0, ""), most=self._most))
             rows.append(
                 {**facts, **texts, "id": said(one.id), **_between(one.from_us, one.to_us), "audit": word}
             )
@@ -288,7 +287,7 @@ class Inquiries:
         rows = []
         for name in streams or inventory.check_recorded(self._cloud, robot):
             select(robot, name)
-            word = verdict(self._cloud, robot, name, start_us, end_us, most=MOST_BATCHES)
+            word = verdict(self._cloud, robot, name, start_us, end_us, most=self._most)
             if not word.batches:
                 inventory.check_there(self._cloud, robot, name)
             counts = {"batches": word.batches, "missing_batches": word.missing}
@@ -370,16 +369,16 @@ def _range(start: str, end: str, most_us: int) -> tuple[int, int]:
     return start_us, end_us
 
 
-def _bounded() -> Callable[[int, int], None]:
+def _bounded(most: int) -> Callable[[int, int], None]:
     """Progress of a reading that ends it at too many batches."""
     read = 0
 
     def progress(more: int, last_us: int) -> None:
         nonlocal read
         read += more
-        if read > MOST_BATCHES:
+        if read > most:
             raise UsageError(
-                f"the range has more than {MOST_BATCHES:,} batches, and was read to {iso(last_us)}: choose a "
+                f"the range has more than {most:,} batches, and was read to {iso(last_us)}: choose a "
                 "shorter one"
             )
 

@@ -224,6 +224,12 @@ def test_the_page_is_in_the_stations_wheel(station, cloud):
             dashboard.terminate()
 
 
+def test_the_pages_that_programs_read_are_in_the_stations_wheel(station):
+    listed = "from iort_station.mcp import documents; print(*documents().values())"
+    pages = station.run("python", "-c", listed).split()
+    assert str(station.site / "iort_station" / "documents" / "reference" / "queries.md") in pages
+
+
 def test_an_error_outside_a_checkout_explains_how_to_name_the_cloud(station):
     with station.start("iort", "--local", "robots", "list") as process:
         _, said = process.communicate()

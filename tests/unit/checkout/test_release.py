@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts import release
+from scripts import release, wheelhouse
 from scripts.release import ReleaseError
 from testkit import ROOT
 
@@ -104,3 +104,25 @@ def test_a_folder_that_is_no_checkout_is_refused(checkout: Path) -> None:
     shutil.rmtree(checkout / ".git")
     with pytest.raises(ReleaseError, match="must succeed, got: fatal: not a git repository"):
         release.refuse(checkout)
+
+
+@pytest.mark.parametrize("architecture", wheelhouse.ARCHITECTURES)
+@pytest.mark.parametrize("python", wheelhouse.PYTHONS)
+def test_the_lock_names_one_version_of_each_package_for_each_robot(architecture: str, python: str) -> None:
+    pinned = dict(wheelhouse.needed(architecture, python))
+    names = [one.partition("==")[0] for one in pinned]
+    assert len(names) == len(set(names))
+    assert {"awscrt", "cryptography", "mcap", "numpy", "pip", "pyserial", "websocket-client"} <= set(names)
+    assert all(re.fullmatch("sha256:[0-9a-f]{64}", one) for hashes in pinned.values() for one in hashes)
+    assert all(pinned.values())
+
+
+def test_the_robots_tests_run_on_what_the_oldest_robot_gets() -> None:
+    tested = (ROOT / "requirements" / "oldest.txt").read_text()
+    pinned = {one for one, _ in wheelhouse.needed("aarch64", "3.8") if not one.startswith("pip==")}
+    assert {one for one in pinned if f"\n{one} " not in tested} == set()
+
+
+def test_an_architecture_without_packages_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ReleaseError, match="must be one of aarch64, x86_64, got 'armv7l'"):
+        wheelhouse.make("armv7l", [], tmp_path)

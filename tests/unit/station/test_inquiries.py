@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from iort_contract.catalog.vesc import ABSENT_FROM
 from iort_contract.messages.batch import Batch
-from iort_station import inquiries
 from iort_station.cli.main import app
 from iort_station.cli.options import CloudOptions
 from iort_station.errors import StationError, UsageError
@@ -227,7 +226,7 @@ def texts_outside(value, key=""):
         yield value
 
 
-def test_answers_are_bounded_and_say_what_is_cut(stored, monkeypatch):
+def test_answers_are_bounded_and_say_what_is_cut(stored):
     ask, _ = stored
     when = {"start": iso(START), "end": iso(START + 100_000_000)}
     rows = ask.query("car", "vesc", **when, fields=["speed"])
@@ -245,7 +244,7 @@ def test_answers_are_bounded_and_say_what_is_cut(stored, monkeypatch):
         ask.query("car", "vesc", **when, statistics=["mean"], fields=["mode"])
     with pytest.raises(UsageError, match="per lap needs statistics"):
         ask.query("car", "vesc", **when, per="lap")
-    monkeypatch.setattr(inquiries, "MOST_BATCHES", 50)
+    ask = Inquiries(ask._cloud, most_batches=50)
     with pytest.raises(UsageError, match="more than 50 batches, and was read to 20"):
         ask.query("car", "vesc", **when)
     (vesc,) = ask.audit("car", ["vesc"], **when)["streams"]
