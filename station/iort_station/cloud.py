@@ -9,6 +9,7 @@ import json
 import os
 import shlex
 import socket
+import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache, cached_property
@@ -227,29 +228,36 @@ class Cloud:
 
         Raises `StationError` if region or credentials are missing.
         """
+        key = service, region
+        # A session makes one client at a time; a client may be used from several threads. A stop has a cloud
+        # of its own, and so waits for nobody here.
+        with vars(self).setdefault("_making", threading.Lock()):
+            if key not in self._clients:
+                self._clients[key] = self._new_client(service, region)
+        return self._clients[key]
+
+    def _new_client(self, service: str, region: str | None) -> Any:
         from botocore.config import Config  # noqa: PLC0415 - as above
 
-        key = service, region
-        if key not in self._clients:
-            try:
-                self._clients[key] = self._session.client(  # type: ignore[call-overload]  # any service's name
-                    service,
-                    region_name=region,
-                    endpoint_url=self.endpoint_url,
-                    verify=self.ca_bundle,
-                    config=Config(
-                        **self._calls,
-                        # botocore's own text is made anew for each request, in a tenth of a millisecond.
-                        user_agent="iort",
-                    ),
-                )
-            except BotoCoreError as error:
-                raise StationError(f"no AWS client for {service}: {error}") from error
-            if service == "dynamodb":
-                from iort_contract.dynamodb import quick  # noqa: PLC0415 - as above
+        try:
+            client = self._session.client(  # type: ignore[call-overload]  # any service's name
+                service,
+                region_name=region,
+                endpoint_url=self.endpoint_url,
+                verify=self.ca_bundle,
+                config=Config(
+                    **self._calls,
+                    # botocore's own text is made anew for each request, in a tenth of a millisecond.
+                    user_agent="iort",
+                ),
+            )
+        except BotoCoreError as error:
+            raise StationError(f"no AWS client for {service}: {error}") from error
+        if service == "dynamodb":
+            from iort_contract.dynamodb import quick  # noqa: PLC0415 - as above
 
-                quick(self._clients[key])
-        return self._clients[key]
+            quick(client)
+        return client
 
     @property
     def region_name(self) -> str | None:
