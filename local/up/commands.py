@@ -12,10 +12,11 @@ from contextlib import suppress
 from pathlib import Path
 
 from iort_station import kept
+from iort_station.errors import StationError
 from iort_station.kept import owner
+from iort_station.page.password import LEAST_CHARACTERS, Password
 from local.processes import LocalError
 from local.state import NO, StateFolder
-from local.up.network_page import LEAST_CHARACTERS, Password
 
 _REMEMBERED = ("listen", "page", "power_cut", "ports")
 _WORDS = "[LISTEN=address[,name...]] [PAGE=address[,name...]] [POWER_CUT=1] [PORTS=any]"
@@ -112,7 +113,7 @@ def password() -> None:
     folder = parser("up-password", "Set the password of the page in the network.").parse_args().state
     try:
         _change(folder)
-    except (LocalError, EOFError) as error:
+    except (LocalError, StationError, EOFError) as error:
         sys.exit(f"password: {error or 'nothing was typed'}")
 
 

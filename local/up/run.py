@@ -32,13 +32,14 @@ from iort_station.output import write_private
 from iort_station.page import answers as control
 from iort_station.page.answers import actions, answers, downloads
 from iort_station.page.motion import reaching
+from iort_station.page.password import Password, first_password
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.servers import Listen, is_ipv6
 from local.processes import EmulatorError, LocalError
 from local.state import FILE, NO, VERSION, Settings, StateFolder
 from local.up import commands
-from local.up.network_page import SOCKET, NetworkPage, Password, first_password
+from local.up.network_page import SOCKET, NetworkPage
 
 # systemd's notifications: whoever waits for the service knows when it is ready (sd_notify(3)).
 

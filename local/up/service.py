@@ -9,11 +9,12 @@ import sys
 from pathlib import Path
 from string import Template
 
+from iort_station.errors import StationError
+from iort_station.page.password import Password, first_password
 from local.deployment import ROOT
 from local.processes import LocalError
 from local.state import NO, StateFolder
 from local.up import commands
-from local.up.network_page import Password, first_password
 
 NAME = "iort-cloud.service"
 _UNIT = Template("""\
@@ -65,7 +66,7 @@ def main() -> None:
             _check()
             _make_password(given.state, given.page)
             _install(text, of_machine=of_machine)
-    except LocalError as error:
+    except (LocalError, StationError) as error:
         sys.exit(f"up-service: {error}")
 
 

@@ -30,6 +30,11 @@ def pages(environment: Mapping[str, str] = os.environ) -> Path:
     return _data(environment) / "pages"
 
 
+def bridge(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where `iort bridge` keeps its password for a cloud that has no page of its own."""
+    return _data(environment) / "bridge"
+
+
 def _data(environment: Mapping[str, str]) -> Path:
     home = (
         environment.get("XDG_DATA_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".local/share"
@@ -109,6 +114,13 @@ def _is_locked(file: int) -> bool:
     except OSError:
         return True
     return False
+
+
+def page_certificate(folder: Path) -> Path | None:
+    """The file with key and certificate of the page that a running kept cloud serves to a network, if it
+    does; raises `StationError` if none is up."""
+    found = (Path(one.file) for one in Up.load(folder).certificates if one.name == "page")
+    return next(found, None)
 
 
 @dataclass(frozen=True, kw_only=True)

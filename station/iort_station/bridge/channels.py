@@ -135,6 +135,11 @@ class Channels:
         with self._lock:
             return frozenset(+self._subscribers)
 
+    def subscribers(self, topic: int) -> int:
+        """How many subscribe to a topic."""
+        with self._lock:
+            return self._subscribers[topic]
+
     def send(self, message: Message) -> None:
         """Send a message to who subscribes to its topic."""
         self._channels[message.topic].log(message.data, log_time=message.t_ns)

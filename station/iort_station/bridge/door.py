@@ -13,16 +13,25 @@ import json
 import logging
 import secrets
 import ssl
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
-from aiohttp import ClientError, ClientSession, ClientWebSocketResponse, WSCloseCode, WSMsgType, web
+from aiohttp import (
+    ClientError,
+    ClientSession,
+    ClientWebSocketResponse,
+    WSCloseCode,
+    WSMsgType,
+    web,
+)
 
 from iort_station.output import one_line
 from iort_station.page.background import BackgroundServer
+from iort_station.page.password import Password, Tries
 from iort_station.page.places import client_of
 from iort_station.page.server import on_loopback
 
@@ -34,6 +43,8 @@ _OLD_PROTOCOL = "foxglove.websocket.v1"
 ORIGINS = ("https://app.foxglove.dev", "file://")
 MOST_CLIENTS = 16
 MOST_BYTES = 256 * 1024
+# More is not even read: aiohttp ends the connection.
+_MOST_READ_BYTES = 32 * MOST_BYTES
 # A client may send so many messages at once, and so many a second.
 _BURST, _PER_S = 1_000, 200
 # A client that does not answer for so long is gone.
@@ -60,7 +71,7 @@ class Wheel(Protocol):
         """A client has ended."""
 
 
-# Whether the key that a client gives is right: `` `` if it is, or why it may not come in, and the status.
+# Takes the key that a client gives, and its address; returns HTTP's status and why it may not come in.
 Admission = Callable[[str, str], "tuple[int, str] | None"]
 
 
@@ -73,6 +84,31 @@ def one_key(key: str) -> Admission:
         return 401, "the address must end in /?key= and the key that `iort bridge` printed"
 
     return admission
+
+
+class ByPassword:
+    """Admits who has the password, as the page does: each guess takes time, and an address has few."""
+
+    def __init__(self, password: Password) -> None:
+        self._password, self._tries = password, Tries()
+        # A client that connects again with what was right is not a guess. Kept as a digest alone.
+        self._secret, self._right = secrets.token_bytes(32), (0, b"")
+        # One at a time: each takes 64 MB.
+        self._lock = threading.Lock()
+
+    def __call__(self, told: str, address: str) -> tuple[int, str] | None:
+        """As `Admission`."""
+        with self._lock:
+            digest = hmac.digest(self._secret, told.encode(errors="replace"), "sha256")
+            version, right = self._right
+            if version == self._password.version() and hmac.compare_digest(digest, right):
+                return None
+            if wait_s := self._tries.wait_s(address):
+                return 429, f"too many tries: try again in {wait_s + 0.5:.0f} s"
+            if not self._password.is_right(told):
+                return 401, "the address must end in /?key= and the password"
+            self._right = self._password.version(), digest
+            return None
 
 
 def everybody(_told: str, _address: str) -> tuple[int, str] | None:
@@ -126,10 +162,7 @@ class Door(BackgroundServer):
     async def _refusal(self, request: web.BaseRequest, address: str) -> tuple[int, str] | None:
         """Why a client may not come in, with HTTP's status; None if it may."""
         if request.headers.get("Upgrade", "").lower() != "websocket":
-            return (
-                426,
-                "this is no page: open the address in Foxglove, with the connection `Foxglove WebSocket`",
-            )
+            return 426, "this is no page: open its address in Foxglove, as a `Foxglove WebSocket`"
         origin = request.headers.get("Origin")
         if origin is not None and not self._accepts(origin):
             named = one_line(origin[:100])
@@ -153,7 +186,7 @@ class Door(BackgroundServer):
             session.ws_connect(self._inner, protocols=[PROTOCOL], max_msg_size=0) as there,
         ):
             here = web.WebSocketResponse(
-                protocols=[PROTOCOL], max_msg_size=MOST_BYTES, heartbeat=_HEARTBEAT_S, compress=False
+                protocols=[PROTOCOL], max_msg_size=_MOST_READ_BYTES, heartbeat=_HEARTBEAT_S, compress=False
             )
             await here.prepare(request)
             ways = [
@@ -181,6 +214,8 @@ class Door(BackgroundServer):
         async for message in here:
             now_s = time.monotonic()
             left, at_s = min(_BURST, left + (now_s - at_s) * _PER_S) - 1, now_s
+            if message.type in {WSMsgType.TEXT, WSMsgType.BINARY} and len(message.data) > MOST_BYTES:
+                return WSCloseCode.MESSAGE_TOO_BIG, f"a message must have at most {MOST_BYTES} bytes"
             if left < 0:
                 return WSCloseCode.POLICY_VIOLATION, f"a client may send {_PER_S} messages a second"
             if message.type is WSMsgType.TEXT:
@@ -194,8 +229,6 @@ class Door(BackgroundServer):
                     await _answer(here, self._wheel.publish(client, message.data[1:]))
                 else:
                     await there.send_bytes(message.data)
-        if here.close_code == WSCloseCode.MESSAGE_TOO_BIG:
-            return here.close_code, f"a message of a client must have at most {MOST_BYTES} bytes"
         return None
 
     async def _taken(

@@ -151,7 +151,8 @@ class Player:
         now_s = self._monotonic()
         if self._status in (PlaybackStatus.Playing, PlaybackStatus.Buffering):
             moved_ns = self._at_ns + round((now_s - self._at_s) * 1e9 * self._speed)
-            self._at_ns = max(self._at_ns, min(moved_ns, self._read_ns))
+            read_ns = self._read_ns if self._subscribed else self._source.end_ns
+            self._at_ns = max(self._at_ns, min(moved_ns, read_ns))
         self._at_s = now_s
 
     def _state(self, request_id: str | None = None, *, did_seek: bool = False) -> PlaybackState:
@@ -244,8 +245,6 @@ class Player:
         self._has_failed = False
         self._ahead.clear()
         self._ahead_bytes, self._read_ns = 0, at_ns
-        if not self._subscribed:
-            self._read_ns = self._source.end_ns
         self._changed.notify_all()
 
     def _read(self) -> None:

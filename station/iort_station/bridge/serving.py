@@ -5,17 +5,20 @@ from __future__ import annotations
 import errno
 import ssl
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from urllib.parse import quote, urlencode
 
 from iort_station.bridge.channels import Channels, waiting
-from iort_station.bridge.door import Admission, Door, everybody
+from iort_station.bridge.door import Admission, Door, Wheel, everybody
+from iort_station.bridge.driving import ENCODINGS, PublishedWheel
 from iort_station.bridge.live import Live, Streams
 from iort_station.bridge.player import Player
 from iort_station.bridge.stored import Source
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
+from iort_station.fleet.seat import Seat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,19 +73,35 @@ def playing(source: Source, name: str, access: Access) -> Iterator[Served]:
 
 @contextmanager
 def serving(
-    cloud: Cloud, robots: Sequence[str], access: Access, *, way: str, rate_hz: float, token: str = ""
+    cloud: Cloud,
+    robots: Sequence[str],
+    access: Access,
+    *,
+    way: str,
+    rate_hz: float,
+    token: str = "",
+    seat: Seat | None = None,
 ) -> Iterator[Served]:
-    """Serve robots live. Raises `StationError` for an unknown robot, and if the port is in use."""
+    """Serve robots live; with a driver's seat, what clients publish drives.
+
+    Raises `StationError` for an unknown robot, if the port is in use, and for a driver without the right.
+    """
     streams = Streams(cloud, robots)
-    channels = Channels(f"iort {cloud.namespace}", topics=streams.topics)
+    publishes = () if seat is None else ENCODINGS
+    channels = Channels(f"iort {cloud.namespace}", topics=streams.topics, publishes=publishes)
     lanes = Live(cloud, streams, channels, way=way, rate_hz=rate_hz, token=token)
     channels.on_wanted = lanes.rewanted
-    with channels, lanes, _door(channels, access) as served:
-        yield served
+    with ExitStack() as stack:
+        stack.enter_context(channels)
+        stack.enter_context(lanes)
+        wheel = None
+        if seat is not None:
+            wheel = stack.enter_context(PublishedWheel(seat, partial(channels.say, name="driving")))
+        yield stack.enter_context(_door(channels, access, wheel))
 
 
 @contextmanager
-def _door(channels: Channels, access: Access) -> Iterator[Served]:
+def _door(channels: Channels, access: Access, wheel: Wheel | None = None) -> Iterator[Served]:
     door = Door(
         access.host,
         access.port,
@@ -90,6 +109,7 @@ def _door(channels: Channels, access: Access) -> Iterator[Served]:
         admits=access.admits,
         origins=access.origins,
         context=access.context,
+        wheel=wheel,
     )
     try:
         door.start()

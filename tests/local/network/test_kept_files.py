@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 from argon2 import PasswordHasher
 
+from iort_station.page.password import Password
 from local.network.certificates import Authority, ServerCertificate
 from local.persistence import ledger
 from local.processes import LocalError
 from local.state import StateFolder
 from local.up import commands, run
-from local.up.network_page import Password
 
 HOST = "127.0.0.1"
 NOBODY = 65_534

@@ -12,10 +12,11 @@ import pytest
 from argon2 import PasswordHasher
 
 from iort_contract.cloud import IOT
+from iort_station.page.password import TRIES, Password
 from local.network.certificates import LASTS_S, ServerCertificate
 from local.network.servers import Listen
 from local.up import network_page
-from local.up.network_page import COOKIE, SOCKET, TRIES, NetworkPage, Password
+from local.up.network_page import COOKIE, SOCKET, NetworkPage
 from local.up.run import shown
 from testkit.ports import free_port
 from testkit.waiting import GUARD_S, until

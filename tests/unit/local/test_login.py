@@ -7,9 +7,10 @@ import io
 import pytest
 from argon2 import PasswordHasher
 
-from local.processes import LocalError
+from iort_station.errors import StationError
+from iort_station.page.password import ALL_TRIES, ALL_TRY_S, TRIES, TRY_S, Password, Tries, first_password
 from local.up import network_page
-from local.up.network_page import Password, Sessions, Tries, first_password
+from local.up.network_page import Sessions
 
 # A real hash takes 64 MB and a tenth of a second.
 QUICK = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
@@ -53,7 +54,7 @@ def test_a_password_is_made_once_and_kept_as_a_hash(tmp_path):
 
 @pytest.mark.parametrize("short", ["", "123456789", "x" * 1001])
 def test_a_password_of_a_wrong_length_is_refused(tmp_path, short):
-    with pytest.raises(LocalError, match=r"must have 10 to 1000 characters, got \d+"):
+    with pytest.raises(StationError, match=r"must have 10 to 1000 characters, got \d+"):
         Password(tmp_path, QUICK).set(short)
 
 
@@ -76,34 +77,34 @@ def test_a_long_guess_is_not_hashed_and_a_damaged_file_lets_nobody_in(tmp_path):
 def test_an_address_waits_after_its_tries_and_others_do_not():
     now = Now()
     tries = Tries(now)
-    assert [tries.wait_s("192.0.2.1") for _ in range(network_page.TRIES)] == [0.0] * network_page.TRIES
-    assert tries.wait_s("192.0.2.1") == pytest.approx(network_page.TRY_S)
+    assert [tries.wait_s("192.0.2.1") for _ in range(TRIES)] == [0.0] * TRIES
+    assert tries.wait_s("192.0.2.1") == pytest.approx(TRY_S)
     assert tries.wait_s("192.0.2.2") == 0.0
-    now.s += network_page.TRY_S
+    now.s += TRY_S
     assert tries.wait_s("192.0.2.1") == 0.0
     assert tries.wait_s("192.0.2.1") > 0.0
 
 
 def test_the_addresses_of_one_ipv6_network_share_their_tries():
     tries = Tries(Now())
-    assert [tries.wait_s(f"2001:db8::{i}") for i in range(network_page.TRIES)] == [0.0] * network_page.TRIES
+    assert [tries.wait_s(f"2001:db8::{i}") for i in range(TRIES)] == [0.0] * TRIES
     assert tries.wait_s("2001:db8::ffff") > 0.0
 
 
 def test_some_addresses_together_leave_tries_to_others():
     tries = Tries(Now())
     busy = [f"192.0.2.{i}" for i in range(10)]
-    made = sum(tries.wait_s(address) == 0.0 for address in busy for _ in range(network_page.TRIES))
-    assert made < network_page.ALL_TRIES < len(busy) * network_page.TRIES
+    made = sum(tries.wait_s(address) == 0.0 for address in busy for _ in range(TRIES))
+    assert made < ALL_TRIES < len(busy) * TRIES
     assert tries.wait_s(busy[0]) > 0.0
     assert tries.wait_s("198.51.100.1") == 0.0
 
 
 def test_all_addresses_together_have_an_end_too():
     tries = Tries(Now())
-    waits = [tries.wait_s(f"192.0.2.{i}") for i in range(network_page.ALL_TRIES + 1)]
-    assert waits[:-1] == [0.0] * network_page.ALL_TRIES
-    assert waits[-1] == pytest.approx(network_page.ALL_TRY_S)
+    waits = [tries.wait_s(f"192.0.2.{i}") for i in range(ALL_TRIES + 1)]
+    assert waits[:-1] == [0.0] * ALL_TRIES
+    assert waits[-1] == pytest.approx(ALL_TRY_S)
 
 
 def test_a_session_ends_when_nobody_uses_it():

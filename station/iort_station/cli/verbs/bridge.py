@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import secrets
+import ssl
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
@@ -12,17 +15,22 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ
+from iort_station import kept
 from iort_station.cli import options
 from iort_station.cli.console import Lines, tell
 from iort_station.cli.options import AsJson, LiveWay, Token, When, argument, examples, option, ranged
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
+from iort_station.fleet.control import operator
+from iort_station.fleet.driving import Driver
 from iort_station.fleet.roles import transport
+from iort_station.fleet.seat import Seat, limits_of
 from iort_station.times import iso_s
+from iort_station.upkeep.snapshot import VERSION
 
 if TYPE_CHECKING:
-    from iort_station.bridge.serving import Served
+    from iort_station.bridge.serving import Access, Served
     from iort_station.bridge.stored import Source
 
 commands = typer.Typer()
@@ -44,10 +52,27 @@ def bridge(
         option("Live samples a second to ask of each stream.", min=LIVE_MIN_RATE_HZ, max=LIVE_MAX_RATE_HZ),
     ] = LIVE_MAX_RATE_HZ,
     port: Annotated[int, option("The port; 0 takes a free one.", min=0, max=65_535)] = 8765,
+    listen: Annotated[
+        str,
+        option("The address to listen on. Anyone elsewhere needs the page's password.", metavar="ADDRESS"),
+    ] = "127.0.0.1",
+    certificate: Annotated[
+        Path | None,
+        option(
+            "A PEM file with key and certificate, for wss. Default: the page's of `make up`.", metavar="FILE"
+        ),
+    ] = None,
     origin: Annotated[
         list[str] | None,
         option("A web page that may connect, such as https://lichtblick.lab; may be repeated."),
     ] = None,
+    drive: Annotated[
+        bool, option("Let a tool's teleop panel drive the one robot, by /cmd_vel.", "--drive")
+    ] = False,
+    max_speed: Annotated[
+        float, option("The top speed of --drive in m/s; at most the car's own limit.", min=0.01)
+    ] = 1.0,
+    by: Annotated[str | None, option("Who drives, as others see it. Default: the user.")] = None,
     live: LiveWay = None,
     token: Token = "",
     as_json: AsJson = False,
@@ -59,22 +84,28 @@ def bridge(
     docs/how-to/foxglove.md shows each tool.
     """
     # They take longer to load than most commands to run.
-    from iort_station.bridge.serving import Access, playing, serving  # noqa: PLC0415 - as above
+    from iort_station.bridge.serving import playing, serving  # noqa: PLC0415 - as above
 
     names = list(dict.fromkeys(robots or ()))
-    access = Access(port=port, origins=origin or ())
+    access = _access(context, listen, port, certificate, origin or (), keyed=drive)
     with ExitStack() as stack:
         if incident or when != When() or any(name.endswith(_MCAP) for name in names):
+            if drive:
+                raise UsageError("the past cannot be driven: --drive is for a robot that is live")
             source, title = stack.enter_context(_stored(context, when, names, incident))
             extent = f"{iso_s(source.start_ns // 1000)} to {iso_s(source.end_ns // 1000)}"
             what = f"plays {title}, {extent}"
             served = stack.enter_context(playing(source, title, access))
         else:
             cloud = context.obj.cloud()
+            if drive and len(names) != 1:
+                raise UsageError("--drive needs the name of one robot")
             names = names or _every_robot(cloud)
             what = f"{', '.join(names)}, live"
+            seat = _seat(cloud, names[0], max_speed, by) if drive else None
             way = live or transport(cloud)
-            served = stack.enter_context(serving(cloud, names, access, way=way, rate_hz=rate, token=token))
+            lanes = serving(cloud, names, access, way=way, rate_hz=rate, token=token, seat=seat)
+            served = stack.enter_context(lanes)
         _tell(served, what, as_json=as_json)
         threading.Event().wait()
 
@@ -110,6 +141,66 @@ def _every_robot(cloud: Cloud) -> list[str]:
     if not names:
         raise StationError("no robot is registered: `iort robots add` registers one")
     return names
+
+
+def _access(
+    context: typer.Context,
+    listen: str,
+    port: int,
+    certificate: Path | None,
+    origins: Sequence[str],
+    *,
+    keyed: bool,
+) -> Access:
+    """Who may come in: on loopback everybody, or with ``keyed`` who has the key that is printed; elsewhere
+    who has the password."""
+    from iort_station.bridge.door import ByPassword, one_key  # noqa: PLC0415 - as above
+    from iort_station.bridge.serving import Access  # noqa: PLC0415 - as above
+    from iort_station.page.password import Password, first_password  # noqa: PLC0415 - as above
+    from iort_station.page.server import on_loopback  # noqa: PLC0415 - as above
+
+    if on_loopback(listen):
+        if not keyed:
+            return Access(host=listen, port=port, origins=origins, context=_tls(certificate))
+        # Other users of this machine reach it, too.
+        key = secrets.token_urlsafe(16)
+        tls = _tls(certificate)
+        return Access(host=listen, port=port, origins=origins, context=tls, key=key, admits=one_key(key))
+    file: Path | None = context.obj.file()
+    kept_folder = file.parent if file is not None and (file.parent / VERSION).exists() else None
+    password = Password(kept_folder or kept.bridge())
+    if new := password.make():
+        remove = "make up-password" if kept_folder else f"rm {kept.bridge()}/page-password"
+        options.say(f"the {first_password(new, remove, sys.stderr)}")
+    pages = kept.page_certificate(kept_folder) if kept_folder else None
+    tls = _tls(certificate or pages)
+    if tls is None:
+        options.say("without TLS everybody on the way can read the password and the data: give --certificate")
+    return Access(
+        host=listen,
+        port=port,
+        origins=origins,
+        context=tls,
+        admits=ByPassword(password),
+        # Nobody can read it from its hash, so the reader fills it in.
+        key="PASSWORD",
+    )
+
+
+def _tls(certificate: Path | None) -> ssl.SSLContext | None:
+    if certificate is None:
+        return None
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    try:
+        context.load_cert_chain(certificate)
+    except (OSError, ssl.SSLError) as error:
+        raise StationError(f"{certificate} must be a PEM file with key and certificate: {error}") from error
+    return context
+
+
+def _seat(cloud: Cloud, robot: str, max_speed: float, by: str | None) -> Seat:
+    limits = limits_of(cloud, robot)
+    return Seat(cloud, robot, Driver(limits, by or operator(), min(max_speed, limits.max_speed_mps)))
 
 
 def _tell(served: Served, what: str, *, as_json: bool) -> None:
