@@ -9,6 +9,7 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from keyword import iskeyword
 from typing import Any
 
 from bench.report import BENCH, Report, Section
@@ -19,7 +20,20 @@ SECTIONS = (
     *("fleet", "mixed", "fairness"),
 )
 # Each is measured by its name alone.
-ALL = (*SECTIONS, "agent", "drive", "stop", "page", "cold", "analysis", "kept", "guard", "ros2", "recorder")
+ALL = (
+    *SECTIONS,
+    "agent",
+    "drive",
+    "stop",
+    "page",
+    "cold",
+    "analysis",
+    "kept",
+    "guard",
+    "ros2",
+    "recorder",
+    "import",
+)
 
 
 def numbers(text: str) -> list[int]:
@@ -54,7 +68,9 @@ class Declared:
 
 def load(key: str) -> Declared:
     """The declaration of a section."""
-    declared: Declared = import_module(f"bench.sections.{key}").SECTION
+    # A module cannot have the name of a keyword.
+    name = f"{key}_" if iskeyword(key) else key
+    declared: Declared = import_module(f"bench.sections.{name}").SECTION
     return declared
 
 

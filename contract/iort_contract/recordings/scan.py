@@ -66,7 +66,9 @@ class Scan:
         self._there: dict[tuple[Any, ...], Found] = {}
 
     def open(self) -> None:
-        """Read everything once."""
+        """Count everything, unless it is counted already."""
+        if self._there:
+            return
         first, last = 2**63, -1
         for found, t_ns, _ in self.messages(lambda _: True):
             self._there[found] = found

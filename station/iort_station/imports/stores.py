@@ -52,7 +52,7 @@ from iort_station.errors import StationError
 
 TABLE, ARCHIVE = "table", "archive"
 # The archive's function joins the day's hours and compresses them again.
-_LEVEL = 3
+_LEVEL = 2
 _ATTEMPTS = 3
 
 
