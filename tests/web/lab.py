@@ -98,6 +98,10 @@ VIEWS = {
     "fleet": View("#/", "[data-robot=car-1]"),
     "car": View("#/car/car-1", ".gauge"),
     "history": View("#/history/car-1", ".history .charts canvas"),
+    "panels of the past": View(
+        "#/history/car-1?fields=map:pose:speed,speed~pose/x,xy:speed:pose/y,table:vesc,voltage_input",
+        ".rows tbody tr",
+    ),
     "compare": View(
         "#/compare?runs=car-1/2026-05-04T10:00:00.000Z/2026-05-04T10:01:00.000Z,"
         "car-1/2026-05-04T11:00:00.000Z/2026-05-04T11:01:00.000Z",
@@ -179,6 +183,11 @@ def incident(number, state, **given):
     }
 
 
+def trigger(name, when, *, notify=True):
+    more = {"cooldown_s": 60.0, "notify": notify, "answer": "accepted"}
+    return {"name": name, "stream": VESC_STREAM, "when": when, **more}
+
+
 NO_PICTURE = {"jpeg": "", "topic": "", "after_s": 0.0, "field": "", "times_s": [], "values": []}
 LIMITS = {"command": "drive", "speed": "drive.speed", "steering": "drive.steering_angle"}
 LIMITS |= {"max_speed_mps": 2.0, "max_steering_rad": 0.4, "lease_ms": 500}
@@ -208,6 +217,7 @@ class Lab:
         self.shown = {**NO_PICTURE, "field": "current_input"}
         self.shown |= {"times_s": [-2.0, 0.0, 1.0, 2.0], "values": [3.0, -20.0, -21.0, -5.0]}
         self.keeps = {"accepted": True, "reason": "", "online": True}
+        self.triggers = [trigger("brake", "current_input < -15", notify=False)]
         self.notes = []
         self.write({"robot": "car-1", "text": "changed the left front tyre"})
         self.alarms = [
@@ -251,6 +261,23 @@ class Lab:
         path = folder / f"hardbrake-{asked['id']}.mcap"
         path.write_bytes(b"messages")
         return path
+
+    def dry_run(self, asked):
+        self.asked.append(dict(asked))
+        if "sped" in asked["when"]:
+            raise StationError("car-1 has no sped in vesc")
+        return {"edges": 3, "told": 1, "samples": 3000, "times_s": []}
+
+    def add_trigger(self, asked):
+        self.asked.append(dict(asked))
+        if self.keeps["accepted"] is not False:
+            answer = "accepted" if self.keeps["accepted"] else ""
+            self.triggers = [*self.triggers, {**trigger(asked["name"], asked["when"]), "answer": answer}]
+        return self.keeps
+
+    def remove_trigger(self, asked):
+        self.triggers = [one for one in self.triggers if one["name"] != asked["name"]]
+        return {"triggers": self.triggers}
 
     def acknowledge(self, asked):
         self.asked.append(dict(asked))
@@ -316,6 +343,8 @@ class Lab:
                 "note": self.write,
                 "delete_note": self.delete,
                 "keep": self.keep,
+                "add_trigger": self.add_trigger,
+                "remove_trigger": self.remove_trigger,
                 "stop": self.stop,
                 "drive": self.drive,
                 "settings": lambda _: {"settings": SETTINGS, "online": False},
@@ -329,6 +358,7 @@ class Lab:
             "tags": lambda _: {"tags": {"car-1": {"lab": "north"}}},
             "vehicles": lambda _: {"vehicles": {}},
             "streams": lambda _: {"streams": self.streams},
+            "fields": lambda _: FIELDS,
             "runs": lambda _: runs(),
             "history": history,
             "insights": insights,
@@ -336,6 +366,9 @@ class Lab:
             "incidents": self.answer_incidents,
             "incident_picture": self.picture,
             "incident_counts": lambda _: {"counts": {"car-1": len(self.incidents), "car-9": 1}},
+            "triggers": lambda _: {"triggers": self.triggers},
+            "dry_run": self.dry_run,
+            "raceline": lambda _: {"x_m": [], "y_m": [], "lap_s": 0.0, "reason": "the page has no track"},
             "motion": self.motion,
             "laps": of_laps(analysis.laps),
             "delta": of_laps(analysis.delta),
@@ -376,7 +409,22 @@ def runs():
     return {"runs": [run], "older": True, "streams": {VESC_STREAM: extent}}
 
 
+# The fields of its streams.
+FIELDS = {
+    "streams": {
+        VESC_STREAM: {
+            "numbers": [name for name, value in SAMPLE.items() if value is not None],
+            "position": [],
+            "degrees": False,
+        },
+        "pose": {"numbers": ["x", "y"], "position": ["x", "y"], "degrees": False},
+    }
+}
+
+
 def history(asked):
+    if asked["stream"] == "pose":
+        return way(asked)
     start_s, end_s = int(asked["from_us"]) / 1e6, int(asked["to_us"]) / 1e6
     times = [start_s + (end_s - start_s) * i / 200 for i in range(200)]
     fields = {
@@ -385,6 +433,14 @@ def history(asked):
         if isinstance(value, (int, float))
     }
     return past(times, fields, row_s=2)
+
+
+def way(asked):
+    """A circle of 5 m a minute, in steps of a quarter of a second."""
+    start_s, end_s = int(asked["from_us"]) / 1e6, int(asked["to_us"]) / 1e6
+    times = [start_s + i / 4 for i in range(round((end_s - start_s) * 4))]
+    angles = [2 * math.pi * (at - start_s) / 60 for at in times]
+    return past(times, {"x": [5 * math.cos(a) for a in angles], "y": [5 * math.sin(a) for a in angles]})
 
 
 def past(times_s, fields, row_s=0):

@@ -150,7 +150,7 @@ def test_a_note_may_have_the_car_keep_what_was_before_it(open_page, lab, server,
 def test_the_past_has_marks_where_incidents_are(open_page, lab, server):
     lab.incidents, incidents = [], lab.incidents
     page = open_page(server.invitation("#/history/car-1"))
-    chart = page.locator(".history .charts .plot canvas").first
+    chart = page.locator("section[aria-label='Battery voltage'] canvas").first
     chart.wait_for()
     drawn(page)
     before = chart.screenshot()

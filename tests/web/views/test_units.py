@@ -66,6 +66,10 @@ def test_every_view_tells_the_zone_of_its_times(open_page, server, car):
             assert page.locator(".faults th").first.inner_text() == "Since, GMT+5:30"
         if view == "history":
             assert page.locator(".zone").inner_text() == "GMT+5:30"
+        if view == "panels of the past":
+            # The head of the column of times says it, once.
+            assert page.locator(".rows th").first.inner_text().startswith("Time, GMT+5:30")
+            page.evaluate("document.querySelector('.rows tbody').replaceChildren()")
         told = page.evaluate("document.body.textContent")
         assert re.findall(r"\d\d:\d\d:\d\d(?!.{0,24}GMT\+5:30)", told) == [], view
 
@@ -106,6 +110,12 @@ def test_text_and_lines_have_enough_contrast_in_both_themes():
     pairs = re.findall(r"--([a-z0-9-]+): light-dark\((#\w{6}), (#\w{6})\)", style)
     colours = {name: (light, dark) for name, light, dark in pairs}
     lines = {"speed", "voltage", "motor", "battery", "duty", "delay", *(f"hue-{i}" for i in range(1, 7))}
+    ramp = [f"ramp-{i}" for i in range(1, 6)]
+    lines |= {*ramp}
+    # The colours of a way grow lighter from low to high, for those who do not see colours.
+    for theme in (0, 1):
+        steps = [luminance(colours[name][theme]) for name in ramp]
+        assert steps == sorted(steps)
     assert lines < colours.keys()
     # WCAG level AA: 4.5 for text, 3 for graphics.
     wanted = dict.fromkeys(lines, 3.0) | dict.fromkeys(("text", "muted", "good", "warn", "bad"), 4.5)

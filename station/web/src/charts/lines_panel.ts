@@ -51,9 +51,15 @@ export class LinesPanel {
   private shown: Lines = { x: [], hole: 1, columns: [], lines: [] };
   private kind = "";
   private marks: readonly Mark[] = [];
+  private threshold: Threshold | undefined;
 
   constructor(private readonly options: LinesPanelOptions) {
-    this.node = panel(options.title, "", [this.heading, this.aside], this.plot);
+    this.node = panel(
+      options.title,
+      "",
+      [this.heading, this.aside],
+      el("div", { class: "plot-box" }, this.plot),
+    );
   }
 
   /** Draw lines: in the chart that is there, if they are of the same kind. */
@@ -90,7 +96,9 @@ export class LinesPanel {
     this.read(index);
   }
 
+  /** Show a threshold that the viewer drags. */
   limit(threshold: Threshold | undefined): void {
+    this.threshold = threshold;
     if (this.chart) this.chart.limit = threshold;
   }
 
@@ -150,5 +158,6 @@ export class LinesPanel {
       range,
     );
     this.chart.mark(this.marks);
+    this.chart.limit = this.threshold;
   }
 }

@@ -211,7 +211,7 @@ export class Plane extends XYChart {
       this.more.onPoint(null);
     } else if (to === undefined) return;
     else {
-      this.keyed = true;
+      [this.keyed, this.index] = [true, to];
       this.more.onPoint(t[to]!);
       speak(`${dayTime(t[to]!, { fractionalSecondDigits: 1 })}: ${this.more.told(to)}`);
     }

@@ -220,7 +220,8 @@ export class RangeChart {
   set limit(threshold: Threshold | undefined) {
     this.threshold = threshold;
     if (!threshold) this.handle.remove();
-    else if (!this.handle.isConnected) this.plot.over.append(this.handle);
+    // Beside the chart, which is one picture to whoever does not see it.
+    else if (!this.handle.isConnected) this.plot.root.parentElement!.after(this.handle);
     // The axis reaches to it; while it is dragged, the axis stays.
     if (this.handle.matches(":active")) this.placeHandle();
     else this.plot.setData(this.plot.data);
@@ -235,7 +236,10 @@ export class RangeChart {
     if (!threshold) return;
     const { min = 0, max = 1 } = plot.scales[this.limitScale] ?? {};
     const top = plot.valToPos(threshold.value, this.limitScale);
-    handle.style.translate = `0 ${Math.max(0, Math.min(plot.over.clientHeight, top)).toFixed(1)}px`;
+    const [over, around] = [plot.over, handle.parentElement!].map((node) => node.getBoundingClientRect());
+    handle.style.width = `${over!.width}px`;
+    const y = over!.top - around!.top + Math.max(0, Math.min(over!.height, top));
+    handle.style.translate = `${(over!.left - around!.left).toFixed(1)}px ${y.toFixed(1)}px`;
     setAttribute(handle, "aria-valuenow", String(threshold.value));
     setAttribute(handle, "aria-valuemin", String(Math.min(min ?? 0, threshold.value)));
     setAttribute(handle, "aria-valuemax", String(Math.max(max ?? 1, threshold.value)));
@@ -244,13 +248,7 @@ export class RangeChart {
 
   private holdHandle(): void {
     const { handle, plot } = this;
-    // What begins here is no zoom, no click and no pan of the chart.
-    for (const event of ["mousedown", "click", "dblclick", "touchstart"])
-      handle.addEventListener(event, (each) => each.stopPropagation());
-    handle.addEventListener("pointerdown", (event) => {
-      handle.setPointerCapture(event.pointerId);
-      event.stopPropagation();
-    });
+    handle.addEventListener("pointerdown", (event) => handle.setPointerCapture(event.pointerId));
     handle.addEventListener("pointermove", (event) => {
       if (!handle.hasPointerCapture(event.pointerId)) return;
       const y = event.clientY - plot.over.getBoundingClientRect().top;
@@ -278,6 +276,7 @@ export class RangeChart {
 
   destroy(): void {
     this.themed();
+    this.handle.remove();
     this.plot.destroy();
   }
 

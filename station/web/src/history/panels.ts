@@ -47,6 +47,7 @@ export class Panels<D> extends Arranged<Panel<D>> {
     for (const panel of this.panels.values()) this.fill(panel);
     this.set(keys);
     this.chips.replaceChildren(...[...fields].map(([key, label]) => this.chip(key, label)));
+    this.refocus();
   }
 
   clear(): void {

@@ -2,7 +2,7 @@
 
 import type { Value } from "../base/contract";
 import { button, el, panel, setAttribute, Text } from "../base/dom";
-import { dayTime, number, type Spec, write } from "../base/format";
+import { dayTime, number, type Spec, write, zone } from "../base/format";
 import type { Range } from "../base/range";
 import { lastAt } from "../charts/plane";
 import { speak, stepped } from "../charts/spoken";
@@ -154,7 +154,7 @@ export class RowsPanel implements Panel<Past> {
       return el("th", { scope: "col", "aria-sort": sorted }, sort);
     };
     this.head.replaceChildren(
-      cell("", "Time", ""),
+      cell("", "Time", zone(this.times[0]!)),
       ...this.columns.map(({ name, spec }) => cell(name, spec.label, spec.unit)),
     );
   }
@@ -178,7 +178,7 @@ export class RowsPanel implements Panel<Past> {
         : undefined;
     if (to === undefined) return;
     const row = this.order[to]!;
-    this.keyed = true;
+    [this.keyed, this.index] = [true, row];
     if (this.sort.column && (to < this.from || to >= this.from + SHOWN)) this.fill(to - SHOWN / 2);
     this.touch.point(this.times[row]!);
     const values = this.columns.map(({ spec, values }) =>

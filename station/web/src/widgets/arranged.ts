@@ -15,6 +15,8 @@ export class Arranged<P extends Arrangeable> {
   readonly node = el("div", { class: "charts" });
   protected readonly panels = new Map<string, P>();
   private order: string[] = [];
+  /** The list that had the focus when its panel was swapped. */
+  private lost: { readonly key: string; readonly name: string } | undefined;
 
   /** `make` is undefined for a key that is none; `changed` is called after a change by hand. */
   constructor(
@@ -57,8 +59,17 @@ export class Arranged<P extends Arrangeable> {
     const name = document.activeElement?.getAttribute("aria-label");
     this.set(this.order.filter((key) => key !== to).map((key) => (key === from ? to : key)));
     this.changed();
-    const lists = focused ? (this.panels.get(to)?.node.querySelectorAll("select") ?? []) : [];
-    [...lists].find((list) => list.getAttribute("aria-label") === name)?.focus();
+    this.lost = focused && name ? { key: to, name } : undefined;
+    this.refocus();
+  }
+
+  /** Give the focus back to the list of a panel that was swapped, once that is shown. */
+  protected refocus(): void {
+    const node = this.lost && this.panels.get(this.lost.key)?.node;
+    if (!node || node.hidden) return;
+    const { name } = this.lost!;
+    [...node.querySelectorAll("select")].find((list) => list.getAttribute("aria-label") === name)?.focus();
+    this.lost = undefined;
   }
 
   private add(key: string): boolean {
