@@ -66,7 +66,8 @@ def main(robot: str) -> None:
         print(fastest(ride, lab.audit(robot, "vesc", "-10m")))
         print(*map(best, lab.laps(robot, "-10m")))
         print(*said(lab.incidents(robot), lab.findings(robot)), sep="\n")
-        print(first(lab.messages(robot, "scan")))
+        if any(stream.name == "scan" for stream in lab.streams(robot)):
+            print(first(lab.messages(robot, "scan", "-10m")))
     except UsageError as error:
         sys.exit(f"wrong use: {error}")
     except StationError as error:

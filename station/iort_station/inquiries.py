@@ -41,8 +41,6 @@ MOST_SAMPLES_US, MOST_FACTS_US = 31 * _DAY_US, 366 * _DAY_US
 # What an answer has at most: rows or groups, facts in a list, characters of a text, bytes.
 MOST_ROWS, MOST_LISTED, MOST_TEXT, MOST_BYTES = 500, 50, 1000, 400_000
 
-_OF_A_LAP = ("lap", "start_us", "time_s", "complete")
-
 Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=64)]
 When: TypeAlias = Annotated[
     str, Field(max_length=40, description="-10m, -2d, now, or ISO 8601 such as 2026-05-04T10:00:00Z")
@@ -200,10 +198,15 @@ class Inquiries:
                 self._cloud, robot, start_us, end_us, count=MOST_LISTED, progress=_bounded(self._most)
             ):
                 table = run.mined.tables.get(LAPS_TABLE)
-                columns = () if table is None else (table[name].tolist() for name in _OF_A_LAP)
-                for lap, first_us, time_s, complete in zip(*columns, strict=True):
-                    about = {"run": run.run, "lap": lap, "complete": complete}
-                    found.append((first_us, first_us + round(time_s * 1e6), about))
+                if table is None or not len(table["lap"]):
+                    continue
+                starts = table["start_us"].tolist()
+                # A lap ends where the next one begins.
+                ends = [*starts[1:], starts[-1] + round(float(table["time_s"][-1]) * 1e6)]
+                for first_us, last_us, lap, complete in zip(
+                    starts, ends, table["lap"].tolist(), table["complete"].tolist(), strict=True
+                ):
+                    found.append((first_us, last_us, {"run": run.run, "lap": lap, "complete": complete}))
         else:
             found = [(first_us, last_us, {}) for first_us, last_us in bins(result.times_us, duration_us(per))]
         if len(found) > MOST_ROWS:

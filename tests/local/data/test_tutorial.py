@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import module_from_spec, spec_from_file_location
 
 import pytest
 
@@ -42,3 +43,15 @@ def test_the_notebook_answers_its_questions(follow, capsys):
     assert "m/s, at" in capsys.readouterr().out
     follow("README.md")
     assert len(follow("docs/reference/queries.md")["ride"].times_us) == 400
+
+
+def test_the_librarys_example_says_what_was_recorded_and_that_it_is_complete(follow, capsys):
+    names = follow("docs/tutorials/first-question.md")
+    capsys.readouterr()
+    spec = spec_from_file_location("library", ROOT / "docs" / "examples" / "library.py")
+    example = module_from_spec(spec)
+    spec.loader.exec_module(example)
+    example.main(names["ride"].robot)
+    printed = capsys.readouterr().out
+    assert "ended after 8 s, 400 samples of vesc: " in printed
+    assert re.search(r"^\d+\.\d\d m/s of 400 samples, complete$", printed, re.MULTILINE)

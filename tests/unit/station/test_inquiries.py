@@ -6,6 +6,7 @@ import importlib.util
 import random
 from datetime import datetime, timezone
 from decimal import Decimal
+from itertools import pairwise
 
 import duckdb
 import pytest
@@ -21,6 +22,7 @@ from local.deployment import ROOT
 from testkit.dynamodb import TELEMETRY, item_of
 from tests.archived import FakeS3, archive, compact, expire
 from tests.unit.station.data.test_queries import cloud_of
+from tests.unit.station.test_page import WHOLE, driven_cloud
 
 HOUR = 3_600_000_000
 # Nine minutes before midnight, so that the files of two days are read.
@@ -54,6 +56,23 @@ def batches() -> list[Batch]:
     return found
 
 
+def copied(cloud, stream, folder):
+    """The samples of a stream in a copy of the archive, as the example for DuckDB reads them."""
+    for key, body in cloud.bucket.objects.items():
+        (folder / key).parent.mkdir(parents=True, exist_ok=True)
+        (folder / key).write_bytes(body)
+    spec = importlib.util.spec_from_file_location("example", ROOT / "docs" / "examples" / "archive_duckdb.py")
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    database = duckdb.connect()
+    database.execute(example.SAMPLES)
+    files = f"{folder}/archive/robot=car/stream={stream}/*/*.parquet"
+    database.execute(
+        f"CREATE TABLE raw AS SELECT *, epoch_us(time) AS t FROM samples('{files}') ORDER BY time"
+    )
+    return database
+
+
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
     """The recording of a cloud whose table has expired in part, and a copy of its archive in DuckDB."""
@@ -62,21 +81,9 @@ def stored(tmp_path_factory):
     for batch in batches():
         cloud.table.put(TELEMETRY, item_of(batch))
     archive(cloud.table, cloud.bucket)
-    folder = tmp_path_factory.mktemp("copy")
     compact(cloud.table, cloud.bucket)
-    for key, body in cloud.bucket.objects.items():
-        (folder / key).parent.mkdir(parents=True, exist_ok=True)
-        (folder / key).write_bytes(body)
+    database = copied(cloud, "vesc", tmp_path_factory.mktemp("copy"))
     expire(cloud.table, every=lambda number: number % 3 > 0)
-    spec = importlib.util.spec_from_file_location("example", ROOT / "docs" / "examples" / "archive_duckdb.py")
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    database = duckdb.connect()
-    database.execute(example.SAMPLES)
-    files = f"{folder}/archive/robot=car/stream=vesc/*/*.parquet"
-    database.execute(
-        f"CREATE TABLE raw AS SELECT *, epoch_us(time) AS t FROM samples('{files}') ORDER BY time"
-    )
     nulls = ", ".join(
         f"CASE WHEN {name} <= {least} THEN NULL ELSE {name} END AS {name}"
         for name, least in ABSENT_FROM.items()
@@ -191,6 +198,26 @@ def test_the_given_command_has_the_samples_of_the_figures(stored, monkeypatch):
     words = shlex.split(answer["asked"]["recompute"])[1:]
     printed = CliRunner().invoke(app, [*words, "--json"]).stdout.splitlines()
     assert len(printed) == answer["samples"] == answer["groups"][0]["figures"][0]["value"] > 0
+
+
+def test_the_figures_of_laps_are_duckdbs_between_their_times(tmp_path):
+    cloud = driven_cloud()
+    cloud.bucket = FakeS3()
+    archive(cloud.table, cloud.bucket)
+    when = {"start": iso(int(WHOLE["from_us"])), "end": iso(int(WHOLE["to_us"]))}
+    wanted = {"fields": ["speed"], "statistics": ["mean", "max", "p90", "count"], "per": "lap"}
+    answer = Inquiries(cloud).query("car", "vesc", **when, **wanted)
+    laps = answer["groups"]
+    assert [one["lap"] for one in laps] == list(range(1, len(laps) + 1))
+    assert len(laps) >= 6
+    assert all(one["to_us"] == after["from_us"] for one, after in pairwise(laps))
+    database = copied(cloud, "vesc", tmp_path)
+    figures = ", ".join(in_sql(name, "speed") for name in wanted["statistics"])
+    for one in laps:
+        sql = f"SELECT count(*), {figures} FROM raw WHERE t >= ? AND t < ?"
+        (row,) = database.execute(sql, [one["from_us"], one["to_us"]]).fetchall()
+        assert (one["samples"], *(each["value"] for each in one["figures"])) == row
+        assert one["samples"] > 100
 
 
 def test_texts_and_names_of_a_robot_are_data_alone():
