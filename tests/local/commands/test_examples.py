@@ -17,6 +17,7 @@ from iort_contract.messages.files import File, file_key
 from iort_station.fleet import robots
 from iort_station.operations import recompute
 from local.demo import DOWNLINK
+from testkit.bags import written
 from testkit.waiting import until
 from tests.local.conftest import recorded
 from tests.local.data.drives import Agent
@@ -68,6 +69,7 @@ def car7(embedded, tmp_path_factory):
 def test_every_example_does_what_it_says(embedded, iort, car7, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "track.json").write_text(json.dumps({"track": HALL.csv()}))
+    written(tmp_path / "drive.bag", "bag", seconds=1.0)
     # It would wait a minute for Lambda 2's cache of parameters.
     monkeypatch.setattr(recompute, "wait_until_settled", lambda: None)
 
@@ -93,6 +95,6 @@ def test_every_example_does_what_it_says(embedded, iort, car7, tmp_path, monkeyp
         for example in examples(name):
             outcome = iort(*shlex.split(example)[1:])
             assert outcome.exit_code == 0, f"{example}: {outcome.output} {outcome.exception!r}"
-    written = {path.name for path in tmp_path.iterdir()}
-    assert written >= {"speed.png", "track.png", "car7.mcap", "car7.parquet", "bags", "robots", "claim-car9"}
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files >= {"speed.png", "track.png", "car7.mcap", "car7.parquet", "bags", "robots", "claim-car9"}
     assert COMMANDS.keys() >= NOT_RUN

@@ -28,7 +28,7 @@ _DENIED = {"AccessDenied", "AccessDeniedException", "403"}
 _HOUR_US = 3_600_000_000
 
 
-@commands.command("import", epilog=examples("import drive.bag car7", "import --dry-run bags car7"))
+@commands.command("import", epilog=examples("import --dry-run drive.bag car7", "import drive.bag car7"))
 def import_(
     context: typer.Context,
     paths: Annotated[
