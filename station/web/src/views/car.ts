@@ -22,6 +22,7 @@ import { Ring } from "../live/ring";
 import { median, type Robot } from "../live/robot";
 import { numeric, type Stream } from "../live/stream";
 import { may } from "../server/admission";
+import { foxglove } from "../widgets/foxglove";
 import { IncidentsPanel } from "../widgets/incidents_panel";
 import { NotesPanel } from "../widgets/notes_panel";
 import type { Speed } from "../widgets/status_bar";
@@ -165,6 +166,7 @@ export class CarView implements View<RouteTo<"car">> {
     this.links.replaceChildren(
       tool("History", { view: "history", robot: this.name }),
       tool("Insights", { view: "insights", robot: this.name }),
+      ...(this.services.config.answers ? [foxglove(() => this.name)] : []),
       ...(before && after ? [car("‹", "Previous car", before), car("›", "Next car", after)] : []),
     );
   }

@@ -22,6 +22,7 @@ import { Result } from "../history/result";
 import { RunsList } from "../history/runs_list";
 import { GLANCE_HZ, type Looks } from "../link/viewing";
 import { ask, Latest, words } from "../server/answers";
+import { foxglove } from "../widgets/foxglove";
 import { IncidentsPanel, letter } from "../widgets/incidents_panel";
 import { NotesPanel } from "../widgets/notes_panel";
 import { type Services, type View, viewNode } from "./view";
@@ -39,6 +40,12 @@ export class HistoryView implements View<RouteTo<"history">> {
   private readonly name = new Text("car-name", "h2");
   private readonly live = el("a", { class: "tool" }, "Live");
   private readonly insights = el("a", { class: "tool" }, "Insights");
+  private readonly foxglove = foxglove(() => {
+    const shown = this.range
+      ? `--from ${writeTime(this.range[0])} --to ${writeTime(this.range[1])}`
+      : "--last 1h";
+    return `${this.robot} ${shown}`;
+  }, "Open this range in Foxglove");
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly form: RangeForm;
   private readonly runs = new RunsList((before_us) => void this.findRuns(before_us));
@@ -121,7 +128,7 @@ export class HistoryView implements View<RouteTo<"history">> {
     ];
     const beside = [
       el("p", { class: "car-state" }, "history"),
-      el("p", { class: "tools" }, this.live, this.insights),
+      el("p", { class: "tools" }, this.live, this.insights, this.foxglove),
     ];
     this.node = viewNode(
       "history",

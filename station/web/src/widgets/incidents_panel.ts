@@ -8,6 +8,7 @@ import { route } from "../base/route";
 import { bytes } from "../live/attachments";
 import { may } from "../server/admission";
 import { act, ask, Latest, words } from "../server/answers";
+import { foxglove } from "./foxglove";
 import { IncidentPictures } from "./incident_pictures";
 import { save } from "./saving";
 
@@ -186,7 +187,11 @@ export class IncidentsPanel {
         void save("incident.mcap", asked, note, this.saving);
       };
       const label = `Download the incident ${trigger}, ${when(from)}`;
-      about.append(button("Download", load, { "aria-label": label }), note.node);
+      const open = foxglove(
+        () => `--incident ${id}`,
+        `Open the incident ${trigger} in Foxglove, ${when(from)}`,
+      );
+      about.append(button("Download", load, { "aria-label": label }), open, note.node);
     }
     return item;
   }
