@@ -12,6 +12,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
+from itertools import islice
 from typing import Annotated, Any, TypeAlias
 
 from pydantic import Field
@@ -20,6 +21,7 @@ from iort_analysis.samples.blocks import values
 from iort_contract.catalog.analysis import LAPS_TABLE
 from iort_contract.limits import Value
 from iort_contract.messages.analysis import encode_finding
+from iort_contract.tables import NO_ROBOT
 from iort_station.cloud import Cloud
 from iort_station.cost import report
 from iort_station.cost.usage import Usage
@@ -29,6 +31,7 @@ from iort_station.data.queries import Result, query
 from iort_station.data.recorded import select
 from iort_station.data.runs import laps_of_runs
 from iort_station.errors import UsageError
+from iort_station.fleet import registry
 from iort_station.lab import Lab
 from iort_station.operations import quarantine
 from iort_station.operations.verdict import Verdict, verdict
@@ -87,7 +90,7 @@ class Inquiries:
             }
             for one in found
         ]
-        return _listed("robots", rows, {}, _no_samples("facts of the registry"))
+        return _listed("robots", rows, {}, _no_samples("facts of the registry"), most=MOST_ROWS)
 
     def streams(self, robot: Name) -> Facts:
         """A robot's streams: when they begin and end, and their fields with units."""
@@ -101,7 +104,7 @@ class Inquiries:
             for one in self._lab.streams(robot)
         ]
         word = _no_samples("times and names of fields; the tool audit tells what is missing")
-        return _listed("streams", rows, {"robot": robot}, word)
+        return _listed("streams", rows, {"robot": robot}, word, most=MOST_ROWS)
 
     def query(
         self,
@@ -301,8 +304,11 @@ class Inquiries:
     def errors(self, robot: Name | None = None, start: When = "-7d", end: When = "now") -> Facts:
         """The messages that the cloud refused, the newest first: where, why, and how often."""
         start_us, end_us = _range(start, end, MOST_FACTS_US)
-        found = quarantine.entries(self._cloud, robot=robot, since_ms=start_us // 1000)
-        inside = (one for one in found if one.first_ms * 1000 < end_us)
+        entries = quarantine.entries(self._cloud, robot=robot, since_ms=start_us // 1000)
+        found = list(islice(entries, self._most + 1))
+        if not found and robot not in {None, NO_ROBOT}:
+            registry.get(self._cloud, str(robot))
+        inside = (one for one in found[: self._most] if one.first_ms * 1000 < end_us)
         newest = sorted(inside, key=lambda one: (-one.last_ms, one.id))
         rows = [
             {
@@ -318,6 +324,8 @@ class Inquiries:
         waiting = asdict(quarantine.waiting(self._cloud))
         asked = {"robot": robot, **_between(start_us, end_us)}
         facts = _listed("errors", rows, asked, _no_samples("messages that are no samples"), len(newest))
+        if len(found) > self._most:
+            facts["cut"].append(f"only {self._most:,} messages of the quarantine were looked at, in no order")
         return {**facts, "waiting": waiting}
 
     def cost(
@@ -343,11 +351,13 @@ def _answer(asked: Facts, audit: Facts, *, cut: Sequence[str] = (), **facts: Any
     return {"asked": asked, "audit": audit, "cut": list(cut), **facts}
 
 
-def _listed(name: str, rows: list[Facts], asked: Facts, audit: Facts, there: int | None = None) -> Facts:
+def _listed(
+    name: str, rows: list[Facts], asked: Facts, audit: Facts, there: int = 0, *, most: int = MOST_LISTED
+) -> Facts:
     cut = []
-    if len(rows) > MOST_LISTED or (there or 0) > MOST_LISTED:
-        cut = [f"the first {MOST_LISTED} {name}, and there are more: ask for one robot or a shorter range"]
-    return _answer(asked, audit, samples=None, cut=cut, **{name: rows[:MOST_LISTED]})
+    if max(len(rows), there) > most:
+        cut = [f"the first {most} {name}, and there are more: ask for one robot or a shorter range"]
+    return _answer(asked, audit, samples=None, cut=cut, **{name: rows[:most]})
 
 
 def _audit(word: Verdict) -> Facts:

@@ -12,8 +12,11 @@ import duckdb
 import pytest
 from typer.testing import CliRunner
 
+from iort_contract.catalog.streams import INCIDENT_STREAM
 from iort_contract.catalog.vesc import ABSENT_FROM
 from iort_contract.messages.batch import Batch
+from iort_contract.messages.recorder import KEPT, LOST, UPLOADED, Incident
+from iort_contract.topics import RECORD, build_topic
 from iort_station.cli.main import app
 from iort_station.cli.options import CloudOptions
 from iort_station.errors import StationError, UsageError
@@ -238,6 +241,24 @@ def test_texts_and_names_of_a_robot_are_data_alone():
     with pytest.raises(StationError) as error:
         ask.query("car", "vesc", **when, fields=["nothing"])
     assert any("Ignore" in name for name in error.value.nearest)
+
+
+@pytest.mark.parametrize(
+    ("state", "missing", "word"),
+    [(UPLOADED, 0, "complete"), (UPLOADED, 3, "incomplete"), (LOST, 0, "incomplete"), (KEPT, 0, "unknown")],
+)
+def test_an_incident_has_the_recorders_own_word(state, missing, word):
+    kept = Incident(
+        "0123456789abcdef", "low", START, START + 9, state, why="Ignore all", missing=missing, messages=7
+    )
+    columns = {name: [value] for name, value in kept.sample().items()}
+    cloud = cloud_of()
+    topic = build_topic(RECORD, "car", INCIDENT_STREAM)
+    cloud.table.put(TELEMETRY, item_of(Batch("0badcafe", 0, [START + 20], columns), topic))
+    (found,) = Inquiries(cloud).incidents("car", start=iso(START), end=iso(START + 10))["incidents"]
+    assert (found["audit"]["word"], found["messages"], found["missing"]) == (word, 7, missing)
+    assert found["why"] == {"robot_text": "Ignore all"}
+    assert (found["from_us"], found["to_us"], found["changed_us"]) == (START, START + 9, START + 20)
 
 
 def texts_outside(value, key=""):
