@@ -53,11 +53,13 @@ def nested(fields: Mapping[str, Any]) -> dict[str, Any]:
     tree = _Branch()
     for name, value in fields.items():
         *above, last = name.split(".")
-        inner: Any = tree
+        inner, path = tree, ""
         for part in above:
-            inner = inner.setdefault(part, _Branch()) if isinstance(inner, _Branch) else None
-        if not isinstance(inner, _Branch) or isinstance(inner.get(last), _Branch):
-            inner, last = tree, name
+            path = f"{path}.{part}" if path else part
+            if path in fields:
+                inner, last = tree, name
+                break
+            inner = inner.setdefault(part, _Branch())
         inner[last] = value
     return {name: _lists(value) for name, value in tree.items()}
 
