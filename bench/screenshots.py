@@ -20,6 +20,7 @@ from typing import Any
 from bench.load.cars import SimulatedCar, drive
 from bench.proof.fleet import drive_of
 from bench.proof.judging import analysed
+from iort_agent.sources.sim import HALL
 from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.evaluation import evaluate
 from iort_analysis.process import analyse
@@ -80,7 +81,8 @@ def main() -> None:
             namespace=cloud.namespace,
             **embedded.keys.reading(),
             vehicles={f"car{i + 1}": robots.F1TENTH for i in range(_FLEET + 2)},
-            answers=answers(cloud),
+            answers=answers(cloud, HALL),
+            track=HALL,
             downloads=downloads(cloud),
             open_actions=actions(cloud),
             actions=keyed_actions(cloud),
