@@ -23,7 +23,7 @@ from iort_station.imports.stores import ARCHIVE, ArchiveStore, Store, TableStore
 # Messages of an hour may come so much later: a header's stamp is believed for an hour.
 _HOURS_OPEN = 2
 # The progress is told after so many messages.
-_EVERY = 2_000
+_EVERY = 1_000
 
 
 @dataclass

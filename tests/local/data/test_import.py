@@ -187,21 +187,31 @@ def test_a_recent_drive_goes_into_the_table(
 def test_an_interrupted_import_goes_on(
     embedded: EmbeddedCloud, importer: tuple[str, Iort], tmp_path: Path
 ) -> None:
+    """The first of two recordings is imported, and the second one in part."""
     (robot, iort), cloud = importer, embedded.cloud
-    path = made(tmp_path, "bag")
-    plans = look([path], Choice(), start_us=None)
+    paths = []
+    for name in ("a", "b"):
+        (folder := tmp_path / name).mkdir()
+        paths.append(made(folder, "bag"))
+    plans = look(paths, Choice(), start_us=None)
     check(cloud, robot, plans, archive=True, overlap=False, retention_s=86_400)
+    told: list[int] = []
 
-    def stop(_messages: int) -> None:
-        raise KeyboardInterrupt
+    def stop(more: int) -> None:
+        told.append(more)
+        if len(told) == 2:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run(cloud, robot, plans, retention_s=86_400, units_per_s=500, progress=stop)
-    (begun,) = json.loads(iort("import", path, robot, "--dry-run", "--json").stdout)["recordings"]
-    assert begun["begun"]
-    assert not begun["there"]
-    iort("import", path, robot)
-    whole(cloud, robot, tmp_path, path)
+    first, second = json.loads(iort("import", *paths, robot, "--dry-run", "--json").stdout)["recordings"]
+    assert "imported on" in first["there"]
+    assert (second["begun"], second["there"]) == (True, "")
+    iort("import", *paths, robot)
+    for stream, one in audited(cloud, robot).items():
+        assert one.complete
+        assert [each.samples for each in one.runs] == [COUNTS[stream]] * 2
+    assert iort_of(embedded, "archive", "verify", robot).exit_code == 0
 
 
 def test_a_killed_import_into_the_table_goes_on(
@@ -354,7 +364,7 @@ def test_an_incident_of_another_robot_is_refused(importer: tuple[str, Iort], tmp
         writer.add_metadata("incident", {"agent": json.dumps({"robot": "car3"})})
         writer.finish()
     assert "says that it is car3's" in iort("import", path, robot, status=1).output
-    assert "imported 290" in iort("import", path, robot, "--overlap").output.replace(",", "")
+    assert "imported 301" in iort("import", path, robot, "--overlap").output.replace(",", "")
 
 
 def test_a_configuration_chooses_as_the_agent_does(
@@ -377,7 +387,7 @@ def test_a_configuration_chooses_as_the_agent_does(
     assert times[0] == start_ns // 1000, "by arrival, and not by the header"
     config.write_text(yaml.safe_dump({**car, "robot": "car3"}))
     assert "is the configuration of car3" in str(
-        iort("import", path, robot, "--config", config, status=2).exception
+        iort("import", path, robot, "--config", config, status=1).exception
     )
     iort("import", path, robot, "--topic", "/tf")
     assert len(data.query(cloud, robot, "tf").times_us) == COUNTS["tf"]
