@@ -161,15 +161,16 @@ def test_every_module_of_the_wheels_is_imported_by_what_they_declare(agent, stat
 
 
 def manual(page: str, language: str = "sh") -> list[str]:
-    """The commands of iort, or the programs, that a page tells to run."""
-    blocks = re.findall(rf"(?ms)^```{language}\n(.*?)^```", (ROOT / page).read_text())
+    """The commands of iort, or the programs, that a page tells to run, with other names for its robots."""
+    text = re.sub(r"\bcar([17])\b", r"manual\1", (ROOT / page).read_text())
+    blocks = re.findall(rf"(?ms)^```{language}\n(.*?)^```", text)
     if language != "sh":
         return blocks
     lines = [line.partition("  #")[0].strip() for block in blocks for line in block.splitlines()]
     return [line for line in lines if line.startswith(("iort ", "iort-agent "))]
 
 
-def test_the_commands_of_the_readme_and_of_the_first_robot_work(agent, station, cloud):
+def test_the_commands_of_the_readme_and_of_the_first_robot_work(agent, station, cloud, request):
     both = {**cloud, "PATH": f"{station.bin}{os.pathsep}{agent.bin}{os.pathsep}{os.defpath}"}
 
     def typed(command: str, *statuses: int) -> str:
@@ -184,15 +185,16 @@ def test_the_commands_of_the_readme_and_of_the_first_robot_work(agent, station, 
 
     def drive(robot: str) -> None:
         drives.append(station.start("/bin/sh", "-c", f"exec {RUN}--config bundles/{robot}/car.yaml", **both))
+        request.addfinalizer(drives[-1].kill)
         queried = f"iort query {robot} vesc --last all --json"
         until(lambda: typed(queried, 0, 1).count("\n") > 100 or drives[-1].poll() is not None)
 
     # The demo's car, which the manual compares with.
-    typed("iort robots add car1 --out bundles")
-    drive("car1")
+    typed("iort robots add manual1 --out bundles")
+    drive("manual1")
     for command in commands:
         if command.startswith(RUN) and len(drives) < 2:
-            drive("car7")
+            drive("manual7")
         elif command.startswith(INIT):
             assert "nothing to record; the agent's Python cannot import rclpy" in typed(command, 1)
         elif not command.startswith((DASHBOARD, RUN, AUDIT)):
@@ -206,6 +208,7 @@ def test_the_commands_of_the_readme_and_of_the_first_robot_work(agent, station, 
     for command in commands:
         if command.startswith(AUDIT):
             typed(command)
+    typed("iort robots remove manual1 --yes && iort robots remove manual7 --yes")
     assert (station.folder / "ride.mcap").stat().st_size
     assert (station.folder / "cars.png").read_bytes().startswith(b"\x89PNG")
 
