@@ -48,13 +48,7 @@ _NO_MESSAGE = JSONRPCError(
 
 def server(cloud: Cloud) -> MCPServer[Any]:
     """The server for a deployment. It begins to answer with `serve`, or with a client in this process."""
-    made = MCPServer[Any](
-        "iort",
-        instructions=_INSTRUCTIONS,
-        log_level="WARNING",
-        subscriptions=False,
-        warn_on_duplicate_tools=False,
-    )
+    made = MCPServer[Any]("iort", instructions=_INSTRUCTIONS, log_level="WARNING", subscriptions=False)
     tools, door = Inquiries(cloud), _Door()
     reads = ToolAnnotations(read_only_hint=True, destructive_hint=False, open_world_hint=False)
     for tool in (
