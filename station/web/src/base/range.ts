@@ -41,3 +41,14 @@ export const inUs = ([from, to]: Range): { readonly from_us: string; readonly to
 });
 
 export const rangeOf = ({ from_us, to_us }: Extent): Range => rounded([from_us / 1e6, to_us / 1e6]);
+
+/** The last of the rising times that is not after a time; the first one if all are. */
+export function lastAt(times: ArrayLike<number>, at: number): number {
+  let [low, high] = [0, times.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle]! <= at + 1e-6) low = middle + 1;
+    else high = middle;
+  }
+  return Math.min(times.length - 1, Math.max(0, low - 1));
+}

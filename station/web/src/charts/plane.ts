@@ -4,7 +4,7 @@
 import uPlot from "uplot";
 import { el } from "../base/dom";
 import { dayTime } from "../base/format";
-import type { Range } from "../base/range";
+import { lastAt, type Range } from "../base/range";
 import { colour, onTheme } from "../base/theme";
 import { chorded, speak, stepped } from "./spoken";
 import { type Track, XYChart, type XYChartOptions } from "./xy_chart";
@@ -218,17 +218,6 @@ export class Plane extends XYChart {
     event.preventDefault();
     event.stopPropagation();
   }
-}
-
-/** The last of the rising times that is not after a time; the first one if all are. */
-export function lastAt(times: ArrayLike<number>, at: number): number {
-  let [low, high] = [0, times.length];
-  while (low < high) {
-    const middle = (low + high) >> 1;
-    if (times[middle]! <= at + 1e-6) low = middle + 1;
-    else high = middle;
-  }
-  return Math.min(times.length - 1, Math.max(0, low - 1));
 }
 
 /** Colours from the first to the last one, as `rgb(…)`. */

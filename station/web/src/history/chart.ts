@@ -2,9 +2,8 @@
 
 import { choices, el } from "../base/dom";
 import type { Spec } from "../base/format";
-import type { Range } from "../base/range";
+import { lastAt, type Range } from "../base/range";
 import { type Lines, LinesPanel } from "../charts/lines_panel";
-import { lastAt } from "../charts/plane";
 import type { Mark, Threshold } from "../charts/range_chart";
 import type { Panel, Touch } from "./panels";
 

@@ -2,8 +2,8 @@
 
 import type { FieldsAnswer, FieldTable, HistoryAnswer, Value } from "../base/contract";
 import { asSpeed, numbers, type Spec, spec } from "../base/format";
+import { lastAt } from "../base/range";
 import type { Columns } from "../charts/lines_panel";
-import { lastAt } from "../charts/plane";
 import { claimed, partsOf } from "../live/attachments";
 import type { Fleet } from "../live/fleet";
 

@@ -3,8 +3,7 @@
 import type { Config, FieldsAnswer, FieldTable } from "../base/contract";
 import { button, el, form } from "../base/dom";
 import { keep, kept } from "../base/kept";
-import type { Range } from "../base/range";
-import { lastAt } from "../charts/plane";
+import { lastAt, type Range } from "../base/range";
 import type { Hands, Mark } from "../charts/range_chart";
 import { edges } from "../charts/track_map";
 import type { Track } from "../charts/xy_chart";

@@ -3,8 +3,7 @@
 import type { Value } from "../base/contract";
 import { button, el, panel, setAttribute, Text } from "../base/dom";
 import { dayTime, number, type Spec, write, zone } from "../base/format";
-import type { Range } from "../base/range";
-import { lastAt } from "../charts/plane";
+import { lastAt, type Range } from "../base/range";
 import { speak, stepped } from "../charts/spoken";
 import type { Panel, Touch } from "./panels";
 import type { Past } from "./past";
@@ -108,7 +107,7 @@ export class RowsPanel implements Panel<Past> {
   }
 
   destroy(): void {
-    this.touch.point(null);
+    this.node.remove();
   }
 
   private fill(first: number): void {
