@@ -113,6 +113,8 @@ class Incident:
     def merge(self, other: Incident) -> None:
         """Take another incident's edge and window into this one."""
         self.from_us, self.to_us = min(self.from_us, other.from_us), max(self.to_us, other.to_us)
+        if other.ring_from_us < self.ring_from_us:
+            self.follows = ""
         self.ring_from_us = min(self.ring_from_us, other.ring_from_us)
         self.ring_to_us = max(self.ring_to_us, other.ring_to_us)
         # No topics means all.
@@ -215,6 +217,10 @@ class Plan:
                 incident.follows = known
                 incident.from_us += to_us + 1 - begin_us
                 incident.ring_from_us = to_us + 1
+
+    def forget_cuts(self, now_us: int) -> None:
+        """Forget the cuts that are not over yet: the ring is another one, whose time begins anew."""
+        self.cut = {known: one for known, one in self.cut.items() if one[1] < now_us}
 
     def note_cut(self, incident: Incident) -> None:
         """Note that an incident has its file."""
