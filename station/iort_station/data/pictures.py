@@ -38,6 +38,10 @@ SIDE, MOST_PIXELS = 160, 20_000_000
 # What is fetched of a file: its summary, and all.
 _SUMMARY_BYTES, _MOST_BYTES = 4_000_000, 24_000_000
 _MOST_UNPACKED, _MOST_INDEX = 40_000_000, 2_000_000
+# All that is unpacked and decoded: an index may name one chunk, or one message, again and again.
+_MOST_WORK = 200_000_000
+# A progressive JPEG needs about ten passes over its pixels. One of thousands takes hours in a few kilobytes.
+_SCAN, _MOST_SCANS = b"\xff\xda", 64
 # A line: so long around the edge, of so many points, from so many chunks.
 _BEFORE_NS, _AFTER_NS = 15_000_000_000, 15_000_000_000
 _MOST_POINTS, _MOST_CHUNKS = 200, 8
@@ -105,6 +109,7 @@ class _Incident:
     def __init__(self, file: Ranged, chunks: Sequence[ChunkIndex], edge_ns: int) -> None:
         self._file, self._chunks, self.edge_ns = file, chunks, edge_ns
         self._unpacked: tuple[int, bytes] | None = None
+        self._work = _MOST_WORK
 
     def nearest(self, channel: Channel) -> Message | None:
         """The channel's message nearest to the edge."""
@@ -153,6 +158,7 @@ class _Incident:
         content = self._content(chunk)
         _, length = _RECORD.unpack_from(content, at)
         begin = at + _RECORD.size
+        self._take(min(length, len(content)))
         return Message.read(ReadDataStream(io.BytesIO(content[begin : begin + length])), length)
 
     def _content(self, chunk: ChunkIndex) -> bytes:
@@ -160,8 +166,15 @@ class _Incident:
         if self._unpacked is None or self._unpacked[0] != chunk.chunk_start_offset:
             self._file.seek(chunk.chunk_start_offset + _RECORD.size)
             record = Chunk.read(ReadDataStream(cast("IO[bytes]", self._file)))
-            self._unpacked = chunk.chunk_start_offset, _unpacked(record.compression, record.data)
+            content = _unpacked(record.compression, record.data)
+            self._take(len(content))
+            self._unpacked = chunk.chunk_start_offset, content
         return self._unpacked[1]
+
+    def _take(self, size: int) -> None:
+        self._work -= size
+        if self._work < 0:
+            raise ValueError("there is too much to decode")
 
 
 def _unpacked(compression: str, data: bytes) -> bytes:
@@ -202,19 +215,21 @@ def _image(incident: _Incident, channels: Sequence[tuple[Channel, Schema | None]
             message = incident.nearest(channel)
             if message is not None:
                 sample = _decoder(schema, large=True).decode(message.data)
-                jpeg = _jpeg_of_raw(sample) if raw else _jpeg(io.BytesIO(cast("bytes", sample["data"])))
+                jpeg = _jpeg_of_raw(sample) if raw else _jpeg(cast("bytes", sample["data"]))
                 return Picture(jpeg, topic, (message.log_time - incident.edge_ns) / 1e9)
     return None
 
 
-def _jpeg(content: IO[bytes]) -> bytes:
+def _jpeg(content: bytes) -> bytes:
     """A JPEG or PNG, small."""
     from PIL import Image  # noqa: PLC0415 - only pictures need it
 
     try:
-        with Image.open(content, formats=("JPEG", "PNG")) as image:
+        with Image.open(io.BytesIO(content), formats=("JPEG", "PNG")) as image:
             if image.width * image.height > MOST_PIXELS:
                 raise ValueError("the image is too large")
+            if image.format == "JPEG" and content.count(_SCAN) > _MOST_SCANS:
+                raise ValueError("the image has too many scans")
             # A JPEG is decoded at a part of its size.
             image.draft("RGB", (2 * SIDE, 2 * SIDE))
             return _small(image.convert("RGB"))
