@@ -129,7 +129,7 @@ class Incident:
     def sample(self) -> dict[str, Value]:
         """The incident as a sample for the readers."""
         first = self.edges[0]
-        values = ", ".join(f"{name}={value}" for name, value in first.values.items())
+        values = ", ".join(f"{name}={_short(value)}" for name, value in first.values.items())
         return recorder.Incident(
             id=self.id,
             trigger=self.names,
@@ -263,6 +263,11 @@ class Plan:
             _log.error("%s", self.alarm)
             return
         self.incidents = {incident.id: incident for incident in incidents}
+
+
+def _short(value: Value) -> str:
+    """A value for people; the file's metadata have it whole."""
+    return f"{value:.4g}" if type(value) is float else str(value)
 
 
 def _day(now_us: int) -> str:

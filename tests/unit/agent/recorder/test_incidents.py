@@ -99,6 +99,7 @@ def test_windows_that_overlap_are_one_incident_of_several_triggers(tmp_path: Pat
     _, metadata = content(only_file(rig))
     assert metadata["iort.incident"]["trigger"] == "hardbrake, long"
     assert rig.told[-1].trigger == "hardbrake,long,take"
+    assert "current_input=-20" in rig.told[-1].why
     assert (rig.told[-1].from_us, rig.told[-1].to_us) == (edge_us - 5 * S, edge_us + 9 * S)
     assert rig.told[-1].by == "anna"
     # The take wants all topics.
