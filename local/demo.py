@@ -140,6 +140,8 @@ ROBOT_LOG = "ros2-car.log"
 _SOURCE_RATE_HZ = 50
 # Ten pings a second of half a kilobyte over each path.
 _PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
+# An hour of the demo's car.
+_RECORDER = {"max_mb": 200}
 # `iort send car1 drive '{"drive": {"speed": 1.0}}' --lease-ms 5000`, and the stick of page and terminal.
 # Nobody is hurt by a long lease.
 DOWNLINK = stick_downlink(MAX_LEASE_MS)
@@ -235,16 +237,19 @@ class _Demo:
         self._console.print(f"{time.monotonic() - self._began:5.1f} s  {name}", highlight=False)
 
     def _settings(self, *, ends: bool = True) -> dict[str, Any]:
+        return {**self._driven(ends=ends), "ping": _PING, "recorder": _RECORDER}
+
+    def _driven(self, *, ends: bool) -> dict[str, Any]:
+        """What drives: a recording, a car in ROS 2, or one that the agent simulates."""
         if self._options.bag is not None:
             given = {"duration_s": self._options.duration} if self._options.duration and ends else {}
             loop = {} if ends else {"loop": True}
             bag = {"type": "bag", "path": str(self._options.bag.resolve()), **given, **loop}
-            return {"sources": [bag], "ping": _PING}
+            return {"sources": [bag]}
         ros2: ros2_car.Ros2 | None = self._options.ros2 or None
         if ros2 is not None:
-            downlink = ros2.downlink(MAX_LEASE_MS)
-            return {"sources": [ros2.source()], "ping": _PING, "downlink": downlink}
-        return {"sources": [{"type": "sim", **self._car(ends=ends)}], "ping": _PING, "downlink": DOWNLINK}
+            return {"sources": [ros2.source()], "downlink": ros2.downlink(MAX_LEASE_MS)}
+        return {"sources": [{"type": "sim", **self._car(ends=ends)}], "downlink": DOWNLINK}
 
     def _car(self, *, ends: bool) -> dict[str, Any]:
         """The settings of the simulated car."""

@@ -210,8 +210,8 @@ class IotCore:
                 due = earliest
                 self._try_new_client()
             if network.came():
-                soon = self._clock.monotonic() + self._backoff.came_back_s()
-                due = min(due, max(began + pace.shortest_s, soon))
+                now = self._clock.monotonic()
+                due = min(due, now + self._backoff.came_back_s(pace, now - began))
             left = due - self._clock.monotonic()
             if left <= 0:
                 return

@@ -95,22 +95,29 @@ class Backoff:
         self._chance = chance or random.Random()  # noqa: S311 - jitter, not secrets
         self._attempts = 0
         self._pace = UNSTEADY
+        # Waits in a row that a network has shortened, and whether this is one.
+        self._shortened, self._came = 0, False
 
     def reset(self) -> None:
         """Start with short waits again."""
-        self._attempts = 0
+        self._attempts = self._shortened = 0
+        self._came = False
 
     def next_s(self, pace: Pace = UNSTEADY) -> float:
         """Seconds to wait. The first wait has jitter, too; otherwise a fleet would reconnect all at once."""
+        self._shortened, self._came = self._shortened + 1 if self._came else 0, False
         if pace != self._pace:
             self._pace, self._attempts = pace, 0
         self._attempts = min(self._attempts + 1, 16)
         ceiling = min(pace.longest_s, pace.shortest_s * 2.0**self._attempts)
         return pace.shortest_s + self._chance.random() * (ceiling - pace.shortest_s)
 
-    def came_back_s(self) -> float:
-        """Seconds to wait once a network has come."""
-        return self._chance.random() * CAME_BACK_S
+    def came_back_s(self, pace: Pace, since_s: float) -> float:
+        """Seconds to wait once a network has come, ``since_s`` after the last attempt. One that comes again
+        and again, as where containers start, and is of no help, is waited for twice as long each time."""
+        self._came = True
+        shortest_s = min(pace.longest_s, pace.shortest_s * 2.0 ** min(self._shortened, 16))
+        return max(shortest_s - since_s, self._chance.random() * CAME_BACK_S)
 
 
 class Causes:

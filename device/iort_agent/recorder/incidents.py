@@ -104,6 +104,8 @@ class Incidents:
         self.counts = dict.fromkeys(("edges", "cooled", "merged", *STATES), 0)
         for part in folder.glob(f"*{cut.PART}"):
             part.unlink(missing_ok=True)
+        with plan.lock:
+            plan.forget_cuts(ring.now_us())
 
     def tell_again(self) -> None:
         """Tell what the run before may not have told."""

@@ -32,8 +32,9 @@ SHARE, _MOST_FILES = 0.125, 64
 _TOGETHER, _TOGETHER_BYTES, _TOGETHER_US = 16, 1_000_000, 1_000_000
 # What is in force and waits in memory for a disk that is full.
 _MEMORY_BYTES = 16_000_000
-# The key of a channel's metadata that names the publisher.
-_PUBLISHER = "iort_publisher"
+# Keys of a channel's metadata: the publisher, and the size of a message that is too large. That one is kept
+# without its bytes, because what was before it is not in force any more.
+_PUBLISHER, _TOO_LARGE = "iort_publisher", "iort_too_large"
 # A topic's publisher: stream, topic, schema, publisher.
 _Key = Tuple[str, str, str, str]
 
@@ -83,6 +84,11 @@ class LatchedFolder:
         """Bytes on disk."""
         return sum(self._sizes.values())
 
+    @property
+    def newest_us(self) -> int:
+        """When the newest message came, by the ring's time; 0 without one."""
+        return self._known[-1].ring_us if self._known else 0
+
     def put(self, message: RingMessage, publisher: str, *, again: bool) -> None:
         """Take a message; one that came ``again`` is in force since before it came, if it is not known."""
         digest = _digest(message.data)
@@ -94,12 +100,15 @@ class LatchedFolder:
             return
         if len(message.data) > self._max_bytes // 2:
             self.dropped += 1
-            return
+            channel = message.channel
+            metadata = {**channel.metadata, _TOO_LARGE: str(len(message.data))}
+            message = message._replace(channel=channel._replace(metadata=metadata), data=b"")
         if again:
             message = message._replace(ring_us=max((one.ring_us + 1 for one in same), default=0))
         waiting.append((publisher, message, digest))
-        while len(waiting) > 1 and _too_many([len(one[1].data) for one in waiting]):
-            waiting.pop(0)
+        mine = [one for one in waiting if one[0] == publisher]
+        while len(mine) > 1 and _too_many([len(one[1].data) for one in mine]):
+            waiting.remove(mine.pop(0))
 
     def tick(self, now_us: int, since_us: int, *, flush: bool = False) -> list[SegmentFile]:
         """Write what has waited, or all; the files to be synced. ``since_us`` is the ring's begin."""
@@ -128,7 +137,8 @@ class LatchedFolder:
         for file in sorted({one.file for one in chosen}):
             here = {(one.key, one.ring_us, one.digest) for one in chosen if one.file == file}
             for publisher, message, digest in _read(self._path(file), channels):
-                if (_key(message.channel, publisher), message.ring_us, digest) in here:
+                named = (_key(message.channel, publisher), message.ring_us, digest) in here
+                if named and _TOO_LARGE not in message.channel.metadata:
                     found.append((publisher, message))
         found.sort(key=lambda one: one[1].ring_us)
         return Latched(found, frozenset(one.key[1] for one in known))
@@ -159,14 +169,14 @@ class LatchedFolder:
         self._next += 1
         file = SegmentFile(self._path(number), waiting[0][1].ring_us, compression=self._compression)
         try:
-            named: dict[str, RingChannel] = {}
+            named: dict[tuple[str, str], RingChannel] = {}
             for publisher, message, _ in waiting:
                 channel = message.channel
                 # A file has one topic's messages of one type.
-                if publisher not in named:
-                    metadata = {**channel.metadata, _PUBLISHER: publisher}
-                    named[publisher] = channel._replace(metadata=metadata)
-                file.add(named[publisher], message.seq, message.ring_us, message.t_us, message.data)
+                key = publisher, channel.metadata.get(_TOO_LARGE, "")
+                if key not in named:
+                    named[key] = channel._replace(metadata={**channel.metadata, _PUBLISHER: publisher})
+                file.add(named[key], message.seq, message.ring_us, message.t_us, message.data)
             file.finish()
         except OSError:
             file.abandon()
@@ -182,7 +192,7 @@ class LatchedFolder:
                 one.channel.encoding == "cdr",
                 one.ring_us,
                 digest,
-                len(one.data),
+                int(one.channel.metadata.get(_TOO_LARGE, len(one.data))),
                 file,
             )
             for publisher, one, digest in messages

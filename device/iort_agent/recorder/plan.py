@@ -113,6 +113,8 @@ class Incident:
     def merge(self, other: Incident) -> None:
         """Take another incident's edge and window into this one."""
         self.from_us, self.to_us = min(self.from_us, other.from_us), max(self.to_us, other.to_us)
+        if other.ring_from_us < self.ring_from_us:
+            self.follows = ""
         self.ring_from_us = min(self.ring_from_us, other.ring_from_us)
         self.ring_to_us = max(self.ring_to_us, other.ring_to_us)
         # No topics means all.
@@ -127,7 +129,7 @@ class Incident:
     def sample(self) -> dict[str, Value]:
         """The incident as a sample for the readers."""
         first = self.edges[0]
-        values = ", ".join(f"{name}={value}" for name, value in first.values.items())
+        values = ", ".join(f"{name}={_short(value)}" for name, value in first.values.items())
         return recorder.Incident(
             id=self.id,
             trigger=self.names,
@@ -216,6 +218,10 @@ class Plan:
                 incident.from_us += to_us + 1 - begin_us
                 incident.ring_from_us = to_us + 1
 
+    def forget_cuts(self, now_us: int) -> None:
+        """Forget the cuts that are not over yet: the ring is another one, whose time begins anew."""
+        self.cut = {known: one for known, one in self.cut.items() if one[1] < now_us}
+
     def note_cut(self, incident: Incident) -> None:
         """Note that an incident has its file."""
         self.cut[incident.id] = incident.ring_from_us, incident.ring_to_us, incident.topics
@@ -257,6 +263,11 @@ class Plan:
             _log.error("%s", self.alarm)
             return
         self.incidents = {incident.id: incident for incident in incidents}
+
+
+def _short(value: Value) -> str:
+    """A value for people; the file's metadata have it whole."""
+    return f"{value:.4g}" if type(value) is float else str(value)
 
 
 def _day(now_us: int) -> str:

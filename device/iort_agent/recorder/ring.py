@@ -82,7 +82,11 @@ class Ring:
         self._clock = clock
         self._folder = RingFolder(folder, config, reserve=reserve)
         self._throttled = ThrottledLog(_log, clock)
-        now_us = clock.now_us()
+        self._latched = LatchedFolder(
+            folder, compression=config.compression, max_bytes=round(config.max_mb * 1e6 * SHARE)
+        )
+        # They may be newer than the last segment.
+        now_us = max(clock.now_us(), self._latched.newest_us + 1)
         found = self._folder.segments()
         if found:
             # The clock may have been set back meanwhile.
@@ -92,9 +96,6 @@ class Ring:
         self._began_us = now_us
 
         self._ledger = Ledger(config.topics)
-        self._latched = LatchedFolder(
-            folder, compression=config.compression, max_bytes=round(config.max_mb * 1e6 * SHARE)
-        )
         self._writer = RingWriter(
             self._folder, self._ledger, clock, run=run, sync_s=config.sync_s, latched=self._latched
         )

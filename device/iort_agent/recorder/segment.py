@@ -146,6 +146,8 @@ class SegmentFile:
             self._writer.start(profile="", library=LIBRARY)
         except OSError:
             self.abandon()
+            # Nobody knows of it.
+            path.unlink()
             raise
 
     @property

@@ -20,6 +20,8 @@ _log = logging.getLogger(__name__)
 # A chunk is closed after this time or these bytes.
 CHUNK_S, CHUNK_BYTES = 0.3, 1024 * 1024
 _BOUNDS_S = 1.0
+# Files that wait for their sync are open.
+_MOST_UNSYNCED = 32
 # The number of a latched message that came again: it is not a new one.
 AGAIN = -1
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -102,7 +104,7 @@ class RingWriter:
         if now - self._bounds_at >= _BOUNDS_S:
             self._bounds_at = now
             self._keep_bounds(now_us)
-        if ending or now - self._synced_at >= self._sync_s:
+        if ending or now - self._synced_at >= self._sync_s or len(self._unsynced) > _MOST_UNSYNCED:
             self._synced_at = now
             self._sync()
 

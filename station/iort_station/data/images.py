@@ -19,6 +19,8 @@ Pixels: TypeAlias = NDArray[np.uint8]
 
 IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
 MOST_PIXELS = 20_000_000
+# A progressive JPEG needs about ten passes over its pixels. One of thousands takes hours in a few kilobytes.
+_SCAN, _MOST_SCANS = b"\xff\xda", 64
 
 
 class Images:
@@ -73,6 +75,8 @@ def _decompressed(data: bytes, least: int) -> Pixels:
                 raise StationError(
                     f"an image must have at most {MOST_PIXELS} pixels, got {image.width} by {image.height}"
                 )
+            if image.format == "JPEG" and data.count(_SCAN) > _MOST_SCANS:
+                raise StationError(f"a JPEG must have at most {_MOST_SCANS} scans")
             if least:
                 # A JPEG is decoded at a part of its size.
                 image.draft("RGB", (least, least))

@@ -40,6 +40,8 @@ SIDE = 160
 # What is fetched of a file: its summary, and all.
 _SUMMARY_BYTES, _MOST_BYTES = 4_000_000, 24_000_000
 _MOST_UNPACKED, _MOST_INDEX = 40_000_000, 2_000_000
+# All that is unpacked and decoded: an index may name one chunk, or one message, again and again.
+_MOST_WORK = 200_000_000
 # A line: so long around the edge, of so many points, from so many chunks.
 _BEFORE_NS, _AFTER_NS = 15_000_000_000, 15_000_000_000
 _MOST_POINTS, _MOST_CHUNKS = 200, 8
@@ -105,6 +107,7 @@ class _Incident:
     def __init__(self, file: Ranged, chunks: Sequence[ChunkIndex], edge_ns: int) -> None:
         self._file, self._chunks, self.edge_ns = file, chunks, edge_ns
         self._unpacked: tuple[int, bytes] | None = None
+        self._work = _MOST_WORK
 
     def nearest(self, channel: Channel) -> Message | None:
         """The channel's message nearest to the edge."""
@@ -153,6 +156,7 @@ class _Incident:
         content = self._content(chunk)
         _, length = _RECORD.unpack_from(content, at)
         begin = at + _RECORD.size
+        self._take(min(length, len(content)))
         return Message.read(ReadDataStream(io.BytesIO(content[begin : begin + length])), length)
 
     def _content(self, chunk: ChunkIndex) -> bytes:
@@ -160,8 +164,15 @@ class _Incident:
         if self._unpacked is None or self._unpacked[0] != chunk.chunk_start_offset:
             self._file.seek(chunk.chunk_start_offset + _RECORD.size)
             record = Chunk.read(ReadDataStream(cast("IO[bytes]", self._file)))
-            self._unpacked = chunk.chunk_start_offset, _unpacked(record.compression, record.data)
+            content = _unpacked(record.compression, record.data)
+            self._take(len(content))
+            self._unpacked = chunk.chunk_start_offset, content
         return self._unpacked[1]
+
+    def _take(self, size: int) -> None:
+        self._work -= size
+        if self._work < 0:
+            raise ValueError("there is too much to decode")
 
 
 def _unpacked(compression: str, data: bytes) -> bytes:

@@ -154,7 +154,8 @@ def damage(cloud: Cloud, file: StoredFile, progress: CountProgress = lambda _byt
 class Ranged:
     """A stored file that is read in parts, for libraries that seek: only what is read is fetched, in blocks.
 
-    It fetches at most ``most`` bytes, whatever it is asked for; then it raises `ValueError`.
+    It fetches at most ``most`` bytes, whatever it is asked for; then it raises `ValueError`. Less than a
+    block counts as one, so that the requests are bounded, too. Raises `StationError` without a connection.
     """
 
     def __init__(self, cloud: Cloud, file: StoredFile, most: int) -> None:
@@ -183,12 +184,16 @@ class Ranged:
         return self._block[begin : begin + size]
 
     def _fetch(self, size: int) -> None:
-        self.most -= size
+        self.most -= max(size, _BLOCK_BYTES)
         if self.most < 0:
             raise ValueError(f"{self._file.key}: there is too much to read")
         if size:
             part = f"bytes={self._place}-{self._place + size - 1}"
-            body = self._client.get_object(Bucket=self._bucket, Key=self._file.key, Range=part)["Body"]
+            try:
+                body = self._client.get_object(Bucket=self._bucket, Key=self._file.key, Range=part)["Body"]
+            except BotoCoreError as error:
+                # Some of them are an `OSError`, as those of a file that is damaged.
+                raise StationError(f"{self._file.key}: {error}") from error
             self._block, self._from = b"".join(_chunks(body, self._file.key)), self._place
 
 

@@ -20,6 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from local.demo import read
 from local.deployment import ROOT
 from testkit.waiting import until
+from tests.local.conftest import invoke
 from tests.recordings import recording
 
 TIMEOUT_S = 400
@@ -102,6 +103,9 @@ def test_the_demo_runs_until_ctrl_c_and_leaves_no_process(tmp_path):
         )
         assert str(first.pid) in output
         assert processes_of(folder)
+        # What the documentation tries on the demo's car.
+        triggered = invoke(folder, "recorder", "add", "fast", "--robots", "car1", "--when", "speed > 1e6")
+        assert "car1: fast: accepted" in triggered.stdout
     finally:
         first.send_signal(signal.SIGINT)
         first.wait(TIMEOUT_S)

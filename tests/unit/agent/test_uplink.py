@@ -130,6 +130,23 @@ def test_the_ceiling_doubles_and_the_first_wait_is_jittered_too() -> None:
     assert [Backoff(Least()).next_s() for _ in range(3)] == [1, 1, 1]
 
 
+def test_networks_that_come_and_do_not_help_hurry_less_each_time() -> None:
+    backoff = Backoff(Least())
+    waits = []
+    for _ in range(7):
+        backoff.next_s()
+        # Each container that starts brings an address; only the first notice finds the attempt so near.
+        waits.append([backoff.came_back_s(UNSTEADY, 0.0), backoff.came_back_s(UNSTEADY, 40.0)])
+    assert waits == [[1, 0], [2, 0], [4, 0], [8, 0], [16, 0], [30, 0], [30, 0]]
+    backoff.next_s()
+    backoff.next_s()
+    assert backoff.came_back_s(UNSTEADY, 0.0) == 1, "a wait without one begins anew"
+    backoff.reset()
+    backoff.next_s()
+    assert backoff.came_back_s(REFUSED, 0.0) == 60
+    assert Backoff(Most()).came_back_s(UNSTEADY, 10.0) == 2, "and a fleet spreads its attempts"
+
+
 ADDRESS, ADDRESS_GONE, ROUTE, ROUTE_GONE = 20, 21, 24, 25
 
 

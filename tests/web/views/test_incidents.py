@@ -113,6 +113,19 @@ def test_only_the_pictures_that_are_seen_are_asked_for_one_after_another(open_pa
     assert len(lab.pictures) == len(set(lab.pictures)) < 60
 
 
+def test_the_stream_of_incidents_is_no_stream_of_tiles_and_long_words_break(open_page, lab, server, car):
+    lab.incidents[0]["why"] = "speed_mps=" + "4" * 60
+    page = open_page(server.url + "#/car/car-1")
+    car.send({"x_m": 1.0}, stream="pose")
+    car.send({"id": "0a", "state": "kept"}, stream="incidents")
+    show(page, car.send())
+    until(lambda: page.locator("section.stream").count() == 2, "the streams")
+    assert page.locator("section.stream[data-stream=incidents]").count() == 0
+    seen(page)
+    cut = "(node) => node.scrollWidth > node.clientWidth"
+    assert not page.locator(".car .incidents-list").evaluate(cut)
+
+
 def test_the_button_shows_the_cars_answer(open_page, lab, server, car):
     page = open_page(server.invitation("#/car/car-1"))
     show(page, car.send())

@@ -150,7 +150,7 @@ def _table(found: list[RobotIncident]) -> Any:
     shown = table("begin (UTC)", "robot", "length", "trigger", "state", "size", "missing", "id", left=left)
     # A long name takes a second line.
     for name in (1, 3):
-        shown.columns[name].no_wrap = False
+        shown.columns[name].no_wrap, shown.columns[name].min_width = False, 6
     for one in found:
         incident = one.incident
         shown.add_row(
@@ -181,7 +181,7 @@ def _state(incident: Incident) -> str:
 
 def size(incident: Incident) -> str:
     """The size of its file."""
-    return f"{incident.bytes / 1e6:,.1f} MB"
+    return f"{incident.bytes / 1e6:,.1f} MB" if incident.bytes >= 1e6 else f"{incident.bytes / 1e3:,.0f} kB"
 
 
 def as_fields(one: RobotIncident) -> dict[str, Any]:

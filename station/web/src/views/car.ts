@@ -1,6 +1,6 @@
 // One car in full: gauges, the viewer's charts, the delay by hop, faults, and every field of every stream.
 
-import { LIVE_MAX_RATE_HZ, LOG_STREAM } from "../base/contract";
+import { INCIDENT_STREAM, LIVE_MAX_RATE_HZ, LOG_STREAM } from "../base/contract";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import { AS_SENT, age, type Linear, linear, number } from "../base/format";
 import { type Query, type Route, type RouteTo, route, setAddress } from "../base/route";
@@ -197,7 +197,8 @@ export class CarView implements View<RouteTo<"car">> {
       (a, b) => Number(b === vesc) - Number(a === vesc) || byName(a.name, b.name),
     );
     for (const stream of ordered) {
-      if (stream.name === LOG_STREAM) continue;
+      // They have lists of their own.
+      if (stream.name === LOG_STREAM || stream.name === INCIDENT_STREAM) continue;
       let section = this.sections.get(stream);
       if (!section) {
         const except: ReadonlySet<string> = stream === vesc ? gauged : new Set();

@@ -14,8 +14,10 @@ from iort_agent.common.private_files import write_below
 from iort_agent.recorder import incidents, plan
 from iort_agent.recorder.account import Losses
 from iort_agent.recorder.folder import Drop
+from iort_agent.recorder.plan import Edge, Incident, Plan
 from iort_contract.messages.recorder import KEPT, LOST, NOTIFIED, OVER_BUDGET, UPLOADED, Take
 from iort_contract.topics import ACCEPTED
+from testkit.agent import ManualClock
 from tests.unit.agent.recorder.rig import BRAKE, T0, FakeRing, Rig, S
 
 
@@ -97,6 +99,7 @@ def test_windows_that_overlap_are_one_incident_of_several_triggers(tmp_path: Pat
     _, metadata = content(only_file(rig))
     assert metadata["iort.incident"]["trigger"] == "hardbrake, long"
     assert rig.told[-1].trigger == "hardbrake,long,take"
+    assert "current_input=-20" in rig.told[-1].why
     assert (rig.told[-1].from_us, rig.told[-1].to_us) == (edge_us - 5 * S, edge_us + 9 * S)
     assert rig.told[-1].by == "anna"
     # The take wants all topics.
@@ -496,6 +499,41 @@ def test_it_follows_one_that_was_uploaded_and_forgotten_before_a_restart(tmp_pat
     rig.cut()
     _, metadata = content(only_file(rig))
     assert metadata["iort.incident"]["follows"] == rig.told[0].id
+
+
+def test_it_is_whole_where_the_cut_is_of_a_ring_whose_time_was_another(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, triggers={"hardbrake": {**BRAKE, "cooldown_s": 0.0}})
+    rig.pass_s(10)
+    rig.brake()
+    rig.pass_s(4)
+    rig.cut()
+    rig.upload()
+    # Its folder is lost, and the clock was set back.
+    rig = Rig(tmp_path, ManualClock(now_us=T0 - 5 * S))
+    rig.pass_s(16)
+    rig.brake()
+    rig.pass_s(4)
+    rig.cut()
+    _, metadata = content(only_file(rig))
+    about = metadata["iort.incident"]
+    assert about["follows"] == ""
+    assert int(about["ring_to_us"]) - int(about["ring_from_us"]) == 7 * S
+
+
+def test_one_that_is_merged_with_an_earlier_window_follows_nothing_any_more(tmp_path: Path) -> None:
+    def one(name: str, from_s: int, to_s: int) -> Incident:
+        window = from_s * S, to_s * S
+        return Incident(name, *window, *window, [Edge("hardbrake", to_s * S)], [])
+
+    plan = Plan(tmp_path)
+    plan.note_cut(one("a" * 16, 10, 20))
+    late = one("b" * 16, 15, 30)
+    plan.follow(late)
+    assert (late.follows, late.ring_from_us) == ("a" * 16, 20 * S + 1)
+    # It could not be cut, and was merged.
+    late.merge(one("c" * 16, 5, 31))
+    plan.follow(late)
+    assert (late.follows, late.ring_from_us) == ("", 5 * S)
 
 
 @pytest.mark.parametrize("why", ["topics", "take", "budget"])

@@ -299,6 +299,75 @@ def test_a_write_that_fails_is_tried_again(tmp_path: Path, monkeypatch: pytest.M
     desk.ring.close()
 
 
+def test_a_disk_that_is_full_has_no_files_that_nobody_knows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk(tmp_path / "ring")
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        for n in range(5):
+            latch(desk, n)
+        assert [*(tmp_path / "ring").rglob("*.mcap")] == []
+    desk.ring.close()
+
+
+def test_each_of_many_publishers_of_ros_1_keeps_its_own_though_all_come_at_once(tmp_path: Path) -> None:
+    desk = Desk(tmp_path / "ring")
+    sent = [body(n, 800_000 if n < 3 else 8) for n in range(40)]
+    for n, data in enumerate(sent):
+        desk.emit("map", desk.clock.now_us(), RosMessage(data, MAP, latched_by=f"/static{n}"))
+    desk.pass_s(3)
+    assert [message.data for _, message in desk.ring.latched(2**62).messages] == sent
+    desk.ring.close()
+
+
+@pytest.mark.parametrize("kind", [MAP, STATIC])
+def test_one_that_is_too_large_ends_the_one_before(tmp_path: Path, kind: RosType) -> None:
+    desk = Desk(tmp_path / "ring", max_mb=16.0, compression="none")
+    old = latch(desk, 1, kind=kind)
+    then_us = desk.ring.now_us()
+    desk.pass_s(3)
+    latch(desk, 2, size=1_500_000, kind=kind)
+    desk.pass_s(3)
+    desk.kill()
+    again = Desk(tmp_path / "ring", desk.clock, run="b", max_mb=16.0)
+    for ring in (desk.ring, again.ring):
+        assert ring.latched(2**62).messages == [], "what is told is not what held before"
+        assert [message.data for _, message in ring.latched(then_us).messages] == [old]
+    again.ring.close()
+
+
+def test_the_ring_s_time_goes_on_behind_the_newest_though_the_clock_was_set_back(tmp_path: Path) -> None:
+    desk = Desk(tmp_path / "ring", max_age_s=20.0)
+    data = latch(desk, 1)
+    desk.pass_s(60)
+    desk.ring.close()
+    for path in (tmp_path / "ring").glob("*.mcap"):
+        path.unlink()
+    again = Desk(tmp_path / "ring", ManualClock(now_us=T0 - 3600 * S), run="b")
+    latch(again, 1)
+    found = again.ring.latched(again.ring.now_us()).messages
+    assert [message.data for _, message in found] == [data]
+    again.ring.close()
+
+
+def test_few_files_are_open_until_they_are_synced(tmp_path: Path) -> None:
+    desk = Desk(tmp_path / "ring", sync_s=60.0)
+    descriptors = Path("/proc/self/fd")
+    before = len([*descriptors.iterdir()])
+    for n in range(20):
+        for topic in range(10):
+            kind = RosType(f"/map{topic}", MAP.name, MAP.md5sum, DEFINITION)
+            desk.emit(f"map{topic}", desk.clock.now_us(), RosMessage(body(n), kind, latched_by="/a"))
+        desk.pass_s(1)
+    assert len([*descriptors.iterdir()]) - before < 60
+    desk.ring.close()
+
+
 def test_what_a_power_cut_tore_costs_itself_alone(tmp_path: Path) -> None:
     desk = Desk(tmp_path / "ring")
     latch(desk, 1)

@@ -10,6 +10,7 @@ import zlib
 
 import numpy as np
 import pytest
+from botocore.exceptions import ConnectTimeoutError, ReadTimeoutError
 from mcap.writer import CompressionType, Writer
 from PIL import Image
 from rosbags.typesys import Stores, get_typestore
@@ -18,6 +19,7 @@ from iort_contract.messages.files import File, file_key
 from iort_contract.messages.recorder import CHANNEL_STREAM
 from iort_station.data import pictures
 from iort_station.data.pictures import SIDE, Picture, picture
+from iort_station.errors import StationError
 from iort_station.fleet import files
 from testkit.dynamodb import FILES
 from tests.images import jpeg
@@ -276,6 +278,19 @@ def test_an_image_that_claims_to_be_vast_is_not_decoded(look, size):
     assert look(incident_file(fill))[0] == Picture()
 
 
+def test_a_jpeg_of_many_passes_is_not_decoded(look):
+    out = io.BytesIO()
+    Image.new("RGB", (640, 480), (255, 0, 0)).save(out, "JPEG", progressive=True)
+    usual = out.getvalue()
+    last = usual[usual.rindex(b"\xff\xda") : -2]
+    found = [
+        look(incident_file(lambda w, c=content: topic(w, "ros1", COMPRESSED)(0, **compressed(c))))[0]
+        for content in (usual, usual[:-2] + 100 * last + usual[-2:])
+    ]
+    assert near(found[0], (255, 0, 0))
+    assert found[1] == Picture()
+
+
 def test_an_image_of_pixels_that_are_not_there_is_not_made(look):
     about = {**raw(np.zeros((4, 4, 3), np.uint8), "rgb8")}
     for wrong in ({"width": 100_000, "height": 100_000}, {"step": 0}, {"height": 0}, {"step": 2**32 - 1}):
@@ -329,6 +344,59 @@ def test_no_more_is_fetched_than_it_may(look, monkeypatch):
     found, fetched = look(incident_file(fill))
     assert found == Picture()
     assert sum(fetched) <= 300_000
+
+
+def test_no_more_is_asked_for_than_it_may_in_however_small_parts(s3):
+    s3.put_object(Bucket=FILES, Key="robots/car/a", Body=bytes(500_000))
+    lab = Lab()
+    lab.bucket = Bucket(s3)
+    file = files.Ranged(
+        lab, files.StoredFile("robots/car/a", "car", "a", 500_000, 0, 0.0), 10 * files._BLOCK_BYTES
+    )
+
+    def backwards():
+        for at in range(1, 1000):
+            file.seek(-at, io.SEEK_END)
+            file.read(1)
+
+    with pytest.raises(ValueError, match="too much"):
+        backwards()
+    assert len(lab.bucket.fetched) == 10
+
+
+def test_no_more_is_unpacked_than_it_may_however_often_it_is_named(look, monkeypatch):
+    """Two chunks whose messages take turns: each point needs the other one."""
+
+    def fill(writer):
+        schema = json.dumps({"properties": {"speed": {}}}).encode()
+        channel = writer.register_channel(
+            "vesc",
+            "json",
+            writer.register_schema("iort.vesc", "jsonschema", schema),
+            {CHANNEL_STREAM: "vesc"},
+        )
+        for first in (0, 1):
+            for i in range(first, 200, 2):
+                at = (RING_US + EDGE_US - FROM_US + i * 10_000) * US
+                writer.add_message(channel, at, json.dumps({"speed": i, "more": "x" * 500}).encode(), at, i)
+            writer.flush()
+
+    content = incident_file(fill)
+    assert look(content)[0].line.values == list(range(200))
+    monkeypatch.setattr(pictures, "_MOST_WORK", 3_000_000)
+    assert look(content)[0] == Picture()
+
+
+@pytest.mark.parametrize("failure", [ConnectTimeoutError, ReadTimeoutError])
+def test_a_bucket_that_is_late_is_told_and_not_taken_for_a_damaged_file(failure):
+    class Late:
+        def get_object(self, **_asked):
+            raise failure(endpoint_url="https://bucket")
+
+    lab = Lab()
+    lab.bucket = Late()
+    with pytest.raises(StationError, match="https://bucket"):
+        picture(lab, files.StoredFile("robots/car/none", "car", "none", 5000, 0, 0.0))
 
 
 def test_a_bucket_that_does_not_answer_is_told(s3):
