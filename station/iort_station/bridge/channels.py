@@ -89,7 +89,6 @@ class Channels:
     def __enter__(self) -> Self:
         # A client's mistake is told to the client, and must not fill the terminal.
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)
-        logging.getLogger("foxglove.websocket").setLevel(logging.CRITICAL)
         capabilities = [Capability.ClientPublish] if self._publishes else []
         if self._range_ns is not None:
             capabilities += [Capability.PlaybackControl, Capability.Time]

@@ -7,6 +7,7 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from iort_contract.messages.shadow import decode_reported
 from iort_station import data
 from iort_station.cloud import EMBEDDED
 from iort_station.operations import audit
@@ -21,6 +23,7 @@ from local.demo import DOWNLINK
 from testkit.waiting import until
 from tests.bridge.judge import Judge
 from tests.local.data.drives import Agent
+from tests.local.robots.test_shadow import Shadow
 
 
 @contextmanager
@@ -92,10 +95,61 @@ def _over(judge: Judge) -> bool:
     return judge.of("state")[-1]["status"] == 3
 
 
+def test_a_panel_drives_the_car_and_the_car_stops_when_its_client_has_gone(embedded: Any, car: Any) -> None:
+    cloud, robot, shadow = embedded.cloud, car.robot, Shadow(embedded, car.robot)
+    pause, driven = threading.Event(), list[str]()
+    with Agent(car):
+        until(lambda: decode_reported(shadow.reported()).drive)
+        with bridge(embedded.folder, robot, "--drive", "--max-speed", "1", "--by", "ada") as served:
+            assert "?key=" in served["url"]
+            with Judge(served["url"]) as judge:
+                assert "clientPublish" in judge.of("server")[0]["info"]["capabilities"]
+                judge.do("subscribe", topic="/iort/vesc")
+                judge.do("advertise", topic="/odom", schema="nav_msgs/Odometry")
+                until(lambda: any("only /cmd_vel" in one["text"] for one in judge.of("status")))
+                judge.do("advertise", topic="/cmd_vel", schema="geometry_msgs/Twist")
+                twist = {"linear": {"x": 0.5, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.1}}
+
+                def said() -> str:
+                    return str(judge.of("status")[-1]["text"])
+
+                def held() -> bool:
+                    """Hold the panel until the car is driven at its speed, and let go."""
+                    while not any(
+                        (one.fields.get("speed"), one.fields.get("driver_by")) == (0.5, "ada")
+                        for one in judge.got("/iort/drive")
+                    ) or not said().startswith("you drive"):
+                        if said().startswith("let go"):
+                            # On a slow machine it may have been refused.
+                            until(lambda: not said().startswith("let go"))
+                        judge.do("publish", topic="/cmd_vel", message=twist)
+                        if "/iort/drive" in judge.topics and not driven:
+                            # A stream that nobody had recorded before.
+                            driven.append("/iort/drive")
+                            judge.do("subscribe", topic="/iort/drive")
+                        pause.wait(0.1)
+                    # Silence is enough: the car stands, and waits.
+                    until(lambda: not said().startswith("you drive"))
+                    return said().startswith("the car stands")
+
+                until(held)
+        until(lambda: list(audit.batches(cloud, robot, "drive")))
+
+        def ended() -> bool:
+            told = data.query(cloud, robot, "drive", "-1h", "now")
+            drivers = data.values(told.columns["driver"])
+            return "accepted" in data.values(told.columns["outcome"]) and drivers[-1] is None
+
+        until(ended)
+    told = data.query(cloud, robot, "drive", "-1h", "now")
+    assert max(speed for speed in data.values(told.columns["speed"]) if speed is not None) == 0.5
+    assert "ada" in data.values(told.columns["by"])
+
+
 def test_what_cannot_be_served_is_said_in_a_line(iort: Any, car: Any, tmp_path: Path) -> None:
     for arguments, words in (
         (["nobody"], "nobody"),
-        ([car.robot, "--last", "1m"], "it has sent nothing yet"),
+        ([car.robot, "--last", "1m"], "nothing is recorded in this range"),
         ([car.robot, "--last", "1m", "--drive"], "the past cannot be driven"),
         (["--drive"], "--drive needs the name of one robot"),
         ([str(tmp_path / "no.mcap")], "must be an MCAP file"),

@@ -9,6 +9,8 @@ from mcap.reader import make_reader
 
 from iort_contract.messages.recorder import UPLOADED
 from iort_contract.tables import ONLINE
+from iort_station.bridge.stored import McapFile
+from iort_station.cli.verbs.incidents import downloaded
 from iort_station.data.incidents import incidents
 from iort_station.fleet import registry
 from testkit.waiting import until
@@ -67,3 +69,7 @@ def test_a_trigger_and_a_take_end_in_files_that_anybody_can_open(iort, bundle, e
         # The simulated car's samples come 20 ms apart.
         assert one["from_us"] <= min(times) < max(times) <= one["to_us"]
         assert len(times) >= 0.9 * (one["to_us"] - one["from_us"]) / 20_000 - 1, one
+        played = McapFile(downloaded(embedded.cloud, one["id"], tmp_path / one["id"]))
+        every = frozenset(range(len(played.topics)))
+        messages = played.messages(played.start_ns, every, lambda: None, lambda _text: None)
+        assert len(list(messages)) == one["messages"], "what `iort bridge --incident` plays"
