@@ -23,22 +23,26 @@ MOST_PIXELS = 20_000_000
 _SCAN, _MOST_SCANS = b"\xff\xda", 64
 
 
+class ImageError(StationError):
+    """A message is no image, or a damaged one."""
+
+
 class Images:
     """Decodes messages of a type of images: CompressedImage with JPEG or PNG, or Image in the encodings of
     `sensor_msgs/image_encodings.hpp` that `_LAYOUTS` has. ``definition`` is the type's text.
 
-    Raises `StationError` for another type.
+    Raises `ImageError` for another type.
     """
 
     def __init__(self, kind: str, definition: str) -> None:
         name = short_kind(kind)
         if name not in {IMAGE, COMPRESSED}:
-            raise StationError(f"a camera must have messages of {IMAGE} or {COMPRESSED}, got {kind}")
+            raise ImageError(f"a camera must have messages of {IMAGE} or {COMPRESSED}, got {kind}")
         self._compressed = name == COMPRESSED
         try:
             self._decoder = Decoder(parse(kind, definition), large=True)
         except ContractError as error:
-            raise StationError(str(error)) from error
+            raise ImageError(str(error)) from error
 
     def pixels(self, raw: bytes, least: int = 0) -> Pixels | None:
         """A message's pixels; None for one whose content was not kept.
@@ -49,10 +53,10 @@ class Images:
         try:
             sample: dict[str, Any] = dict(self._decoder.decode(raw))
         except ContractError as error:
-            raise StationError(str(error)) from error
+            raise ImageError(str(error)) from error
         data = sample.get("data")
         if not isinstance(data, Large):
-            raise StationError("the image has no data")
+            raise ImageError("the image has no data")
         if not data:
             return None
         return _decompressed(data, least) if self._compressed else _of_pixels(sample, data, least)
@@ -72,17 +76,17 @@ def _decompressed(data: bytes, least: int) -> Pixels:
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
             if image.width * image.height > MOST_PIXELS:
-                raise StationError(
+                raise ImageError(
                     f"an image must have at most {MOST_PIXELS} pixels, got {image.width} by {image.height}"
                 )
             if image.format == "JPEG" and data.count(_SCAN) > _MOST_SCANS:
-                raise StationError(f"a JPEG must have at most {_MOST_SCANS} scans")
+                raise ImageError(f"a JPEG must have at most {_MOST_SCANS} scans")
             if least:
                 # A JPEG is decoded at a part of its size.
                 image.draft("RGB", (least, least))
             return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise StationError(f"the image is damaged: {error}") from error
+        raise ImageError(f"the image is damaged: {error}") from error
 
 
 def _of_pixels(sample: dict[str, Any], data: bytes, least: int) -> Pixels:
@@ -92,11 +96,11 @@ def _of_pixels(sample: dict[str, Any], data: bytes, least: int) -> Pixels:
     encoding = str(sample["encoding"])
     layout = _LAYOUTS.get(encoding)
     if layout is None:
-        raise StationError(f"an image's encoding must be one of {', '.join(_LAYOUTS)}, got {encoding[:20]!r}")
+        raise ImageError(f"an image's encoding must be one of {', '.join(_LAYOUTS)}, got {encoding[:20]!r}")
     kind = np.dtype(layout.kind).newbyteorder(">" if sample["is_bigendian"] else "<")
     used = width * layout.values * kind.itemsize
     if not 0 < width * height <= MOST_PIXELS or step < used or len(data) < height * step:
-        raise StationError(f"an image of {width} by {height} {encoding} has {len(data)} bytes, {step} a row")
+        raise ImageError(f"an image of {width} by {height} {encoding} has {len(data)} bytes, {step} a row")
     rows = np.frombuffer(data, np.uint8, height * step).reshape(height, step)
     pixels = rows[:, :used].view(kind).reshape(height, width, layout.values)
     # An even step keeps a pattern of two by two.
@@ -104,7 +108,7 @@ def _of_pixels(sample: dict[str, Any], data: bytes, least: int) -> Pixels:
     shown = layout.shown(pixels, part)
     size = shown.shape[1], shown.shape[0]
     if not all(size):
-        raise StationError(f"an image of {width} by {height} {encoding} is too small")
+        raise ImageError(f"an image of {width} by {height} {encoding} is too small")
     return np.asarray(Image.frombytes(layout.mode, size, shown.astype(np.uint8).tobytes()).convert("RGB"))
 
 

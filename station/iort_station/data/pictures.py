@@ -31,8 +31,7 @@ from iort_contract.ros.decode import Decoder
 from iort_contract.ros.definition import parse, short_kind
 from iort_contract.triggers import parse_trigger
 from iort_station.cloud import Cloud
-from iort_station.data.images import COMPRESSED, IMAGE, Images, Pixels
-from iort_station.errors import StationError
+from iort_station.data.images import COMPRESSED, IMAGE, ImageError, Images, Pixels
 from iort_station.fleet.files import Ranged, StoredFile
 
 # A picture's longest side.
@@ -49,7 +48,7 @@ _MOST_POINTS, _MOST_CHUNKS = 200, 8
 _MOST_TOPICS, _MOST_TOPICS_OF_A_FIELD = 3, 50
 # What a wrong file makes the libraries raise.
 _WRONG = (
-    *(McapError, ContractError, MessageError, StationError),
+    *(McapError, ContractError, MessageError, ImageError),
     *(ValueError, KeyError, IndexError, TypeError, OverflowError, RecursionError, MemoryError),
     *(struct.error, OSError, EOFError, SyntaxError, Warning),
 )
