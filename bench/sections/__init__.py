@@ -33,6 +33,7 @@ ALL = (
     "ros2",
     "recorder",
     "import",
+    "bridge",
 )
 
 

@@ -47,7 +47,7 @@ def run(target: Target, say: Say) -> Section:
     robot = target.robot("bench-command").robot
     say("storing a minute of one robot")
     stored_drive.store(target, robot, stored_drive.simulated(60 * RATE_HZ))
-    iort = [str(Path(sys.executable).parent / "iort"), *_options(target)]
+    iort = [str(Path(sys.executable).parent / "iort"), *options_of(target)]
     tab = {"_IORT_COMPLETE": "complete_bash", "XDG_CACHE_HOME": str(target.folder / "cache")}
     ways: dict[str, tuple[list[str], Mapping[str, str]]] = {
         _PYTHON: ([sys.executable, "-c", "pass"], {}),
@@ -83,7 +83,8 @@ def report(measured: Mapping[str, list[Times]]) -> Section:
     return section
 
 
-def _options(target: Target) -> list[str]:
+def options_of(target: Target) -> list[str]:
+    """The options of `iort` that select a target's cloud."""
     if target.embedded is not None:
         return ["--local", "--embedded", str(target.embedded.folder / EMBEDDED.name)]
     cloud = target.cloud
