@@ -45,6 +45,8 @@ DICTIONARY = (
     b'"energy_drawn":[0,0,0],"energy_regen":[0,0,0],"displacement":[0,0,0],"distance_traveled":[0,0,0],'
     b'"fault_code":[0,0,0,0,0,0,1,0,-1,0,0,0,0,{"dt":[0,20000,19999,20001],"fields":{"voltage_input":[1,'
 )
+# zlib's, which a link to a robot is worth.
+LEVEL = 6
 # Integers below this, divided by any of these powers of ten, are equally exact in the float64 of any
 # language.
 EXACT = 2**53
@@ -52,23 +54,35 @@ SCALES = tuple(float(f"1e{decimals}") for decimals in range(23))
 
 
 def packed_samples(
-    dt: Sequence[int], fields: Mapping[str, Sequence[Value]], behind: bytes = b"", codec: str = CODEC
+    dt: Sequence[int],
+    fields: Mapping[str, Sequence[Value]],
+    behind: bytes = b"",
+    codec: str = CODEC,
+    *,
+    level: int = LEVEL,
 ) -> str:
-    """A batch's times and columns (as made by `wire_column`) in `CODEC`, then a newline and ``behind``.
+    """A batch's times and columns (as made by `wire_column`) in `CODEC`, then a newline and ``behind``;
+    ``level`` is zlib's.
 
     Raises `ContractError` if they are too large.
     """
-    return written_samples(dt, {name: packed(column) for name, column in fields.items()}, behind, codec)
+    columns = {name: packed(column) for name, column in fields.items()}
+    return written_samples(dt, columns, behind, codec, level=level)
 
 
 def written_samples(
-    dt: Sequence[int], columns: Mapping[str, Sequence[Value]], behind: bytes = b"", codec: str = CODEC
+    dt: Sequence[int],
+    columns: Mapping[str, Sequence[Value]],
+    behind: bytes = b"",
+    codec: str = CODEC,
+    *,
+    level: int = LEVEL,
 ) -> str:
     """As `packed_samples`, of columns that are `packed` already."""
     text = COMPACT.encode({"dt": dt, "fields": columns})
     if len(text) > _MOST_BYTES[CODEC]:
         raise ContractError(f"columns of a batch must be at most {_MOST_BYTES[CODEC]} bytes, got {len(text)}")
-    deflater = zlib.compressobj(6, zdict=DICTIONARY)
+    deflater = zlib.compressobj(level, zdict=DICTIONARY)
     body = text.encode() + (b"\n" + behind if behind else b"")
     if len(body) > _MOST_BYTES[codec]:
         raise ContractError(f"batch must be at most {_MOST_BYTES[codec]} bytes, got {len(body)}")

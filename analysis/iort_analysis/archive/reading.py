@@ -189,6 +189,9 @@ def head_of(table: Any, row: int) -> Item:
 
 # The way back from the archive's files to stored items: slow, and for whoever needs whole batches.
 
+# Most of them are inflated again at once.
+_LEVEL = 1
+
 
 def items(file: ArchiveFile, topic: str, hour: Hour | None = None) -> Iterator[Item]:
     """The batches of a file as stored items.
@@ -229,11 +232,11 @@ class _Columns:
         fields = {name: self._values(name, start, end) for name in beside.split(",") if name}
         if layout is None:
             about = self._table[names.ABOUT][start].as_py() or ""
-            return CODEC, packed_samples(dt, fields, about.encode())
+            return CODEC, packed_samples(dt, fields, about.encode(), level=_LEVEL)
         kind = self._table[names.TYPE][start].as_py()
         raw = self._table[names.MESSAGE].slice(start, end - start).to_pylist()
         messages = Messages(kind, layout, raw)
-        return messages.codec, packed_samples(dt, fields, pack(messages), messages.codec)
+        return messages.codec, packed_samples(dt, fields, pack(messages), messages.codec, level=_LEVEL)
 
     def _values(self, name: str, start: int, end: int) -> Sequence[Value]:
         if name not in self._kinds:

@@ -315,8 +315,8 @@ def decode_batch(message: bytes | str | Mapping[str, Any]) -> Batch:
     return decode_envelope(read_envelope(message))
 
 
-def decode_envelope(envelope: Envelope) -> Batch:
-    """Decode the samples; raises `ContractError`."""
+def decode_envelope(envelope: Envelope, *, viewed: bool = True) -> Batch:
+    """Decode the samples; raises `ContractError`. Unless they are ``viewed``, ROS messages stay bytes."""
     times, fields = open_envelope(envelope)
     n = len(times)
     columns: dict[str, Sequence[Value]] = {name: unpacked(name, column, n) for name, column in fields.items()}
@@ -324,9 +324,11 @@ def decode_envelope(envelope: Envelope) -> Batch:
     if not envelope.serialized:
         return batch
     messages = unpack(envelope.behind, n)
-    viewed, nulled = view(messages)
+    if not viewed:
+        return replace(batch, messages=messages)
+    fields, nulled = view(messages)
     return replace(
-        batch, columns={**viewed, **columns}, nonfinite=envelope.nonfinite + nulled, messages=messages
+        batch, columns={**fields, **columns}, nonfinite=envelope.nonfinite + nulled, messages=messages
     )
 
 
@@ -334,12 +336,13 @@ def messages_of(
     message: bytes | str | Mapping[str, Any], layouts: Mapping[str, str]
 ) -> tuple[Batch, Messages | None]:
     """The batch in an envelope, and its ROS messages byte for byte; None if the samples were never messages.
+    Of messages that are kept as they are, the batch's columns are those beside them.
 
     ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode_batch` does, and for an
     unknown type.
     """
     envelope = read_envelope(message)
-    batch = decode_envelope(envelope)
+    batch = decode_envelope(envelope, viewed=False)
     if not envelope.about:
         return batch, batch.messages
     return batch, from_columns(batch.columns, envelope.about, batch.times_us, layouts)
