@@ -27,6 +27,7 @@ from rosbags.typesys import Stores, get_typestore
 from iort_contract.dynamodb import starting_between
 from iort_contract.recordings.rosbag import Recording, Unread
 from iort_contract.recordings.scan import Scan
+from iort_contract.ros.message import RosMessage
 from iort_contract.tables import DEFAULT_RETENTION_DAYS, EXPIRES_S, RECEIVED_MS
 from iort_station import data
 from iort_station.cloud import EMBEDDED, Cloud
@@ -96,7 +97,8 @@ def messages(path: Path, scan: Scan | None = None) -> dict[str, list[tuple[int, 
     with Recording(path, tuple(STREAMS.items()), "vesc", Unread(), reader=scan) as read:
         for one in read:
             if one.stream in COUNTS:
-                found[one.stream].append((one.stamp_ns // 1000, one.values.raw))  # type: ignore[attr-defined]
+                assert isinstance(one.values, RosMessage)
+                found[one.stream].append((one.stamp_ns // 1000, one.values.raw))
     return {stream: sorted(some) for stream, some in found.items()}
 
 
