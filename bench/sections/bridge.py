@@ -17,7 +17,7 @@ from pathlib import Path
 
 from aiohttp import ClientSession, WSMsgType
 
-from bench.report import Section, spread, text
+from bench.report import Report, Section, spread, text
 from bench.sections import Declared, Option
 from bench.sections.command import options_of
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -150,5 +150,6 @@ SECTION = Declared(
     "the bridge's delay and processor time, beside the page's link",
     run,
     (Option("SECONDS", float, 30.0, "of both ways side by side"),),
+    Report("bridge", "The bridge beside the page's link", "make bench ONLY=bridge"),
     dollars=0.001,
 )
