@@ -32,9 +32,9 @@ SHARE, _MOST_FILES = 0.125, 64
 _TOGETHER, _TOGETHER_BYTES, _TOGETHER_US = 16, 1_000_000, 1_000_000
 # What is in force and waits in memory for a disk that is full.
 _MEMORY_BYTES = 16_000_000
-# Keys of a channel's metadata: the publisher, and the size of a message that is too large. That one is kept
+# Keys of a channel's metadata: the publisher, and the size of a message that is gone. That one is kept
 # without its bytes, because what was before it is not in force any more.
-_PUBLISHER, _TOO_LARGE = "iort_publisher", "iort_too_large"
+_PUBLISHER, _GONE = "iort_publisher", "iort_gone"
 # A topic's publisher: stream, topic, schema, publisher.
 _Key = Tuple[str, str, str, str]
 
@@ -73,7 +73,7 @@ class LatchedFolder:
         self._waiting: dict[tuple[str, ...], list[tuple[str, RingMessage, bytes]]] = {}
         self._known: list[_Known] = []
         self._sizes: dict[int, int] = {}
-        # Messages that are too large, or did not find room on the disk.
+        # Messages that are too large, or did not find room in memory or on the disk.
         self.dropped = 0
         for path in sorted(self._folder.glob("*.mcap")):
             self._find(path)
@@ -89,8 +89,9 @@ class LatchedFolder:
         """When the newest message came, by the ring's time; 0 without one."""
         return self._known[-1].ring_us if self._known else 0
 
-    def put(self, message: RingMessage, publisher: str, *, again: bool) -> None:
-        """Take a message; one that came ``again`` is in force since before it came, if it is not known."""
+    def put(self, message: RingMessage, publisher: str, *, again: bool, gone: bool = False) -> None:
+        """Take a message; one that came ``again`` is in force since before it came, if it is not known. One
+        that is too large, or ``gone``, ends the one before it."""
         digest = _digest(message.data)
         key = _key(message.channel, publisher)
         waiting = self._waiting.setdefault(key[:3], [])
@@ -98,10 +99,10 @@ class LatchedFolder:
         digests = [one.digest for one in same] + [one[2] for one in waiting if one[0] == publisher]
         if digests and (digest in digests if again else digest == digests[-1]):
             return
-        if len(message.data) > self._max_bytes // 2:
+        if gone or len(message.data) > self._max_bytes // 2:
             self.dropped += 1
             channel = message.channel
-            metadata = {**channel.metadata, _TOO_LARGE: str(len(message.data))}
+            metadata = {**channel.metadata, _GONE: str(len(message.data))}
             message = message._replace(channel=channel._replace(metadata=metadata), data=b"")
         if again:
             message = message._replace(ring_us=max((one.ring_us + 1 for one in same), default=0))
@@ -138,7 +139,7 @@ class LatchedFolder:
             here = {(one.key, one.ring_us, one.digest) for one in chosen if one.file == file}
             for publisher, message, digest in _read(self._path(file), channels):
                 named = (_key(message.channel, publisher), message.ring_us, digest) in here
-                if named and _TOO_LARGE not in message.channel.metadata:
+                if named and _GONE not in message.channel.metadata:
                     found.append((publisher, message))
         found.sort(key=lambda one: one[1].ring_us)
         return Latched(found, frozenset(one.key[1] for one in known))
@@ -173,7 +174,7 @@ class LatchedFolder:
             for publisher, message, _ in waiting:
                 channel = message.channel
                 # A file has one topic's messages of one type.
-                key = publisher, channel.metadata.get(_TOO_LARGE, "")
+                key = publisher, channel.metadata.get(_GONE, "")
                 if key not in named:
                     named[key] = channel._replace(metadata={**channel.metadata, _PUBLISHER: publisher})
                 file.add(named[key], message.seq, message.ring_us, message.t_us, message.data)
@@ -192,7 +193,7 @@ class LatchedFolder:
                 one.channel.encoding == "cdr",
                 one.ring_us,
                 digest,
-                int(one.channel.metadata.get(_TOO_LARGE, len(one.data))),
+                int(one.channel.metadata.get(_GONE, len(one.data))),
                 file,
             )
             for publisher, one, digest in messages

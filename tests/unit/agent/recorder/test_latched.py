@@ -341,6 +341,21 @@ def test_one_that_is_too_large_ends_the_one_before(tmp_path: Path, kind: RosType
     again.ring.close()
 
 
+def test_one_that_the_memory_has_no_room_for_ends_the_one_before(tmp_path: Path) -> None:
+    desk = Desk(tmp_path / "ring", memory_mb=1.0)
+    latch(desk, 1)
+    other = latch(desk, 1, "/b")
+    desk.imu(0, 40, 32_000)
+    latch(desk, 2, size=32_000)
+    desk.pass_s(3)
+    assert desk.ring.counts()["map"].dropped == {"memory": 1}
+    assert [message.data for _, message in desk.ring.latched(2**62).messages] == [other]
+    newest = latch(desk, 3)
+    desk.pass_s(3)
+    assert [message.data for _, message in desk.ring.latched(2**62).messages] == [other, newest]
+    desk.ring.close()
+
+
 def test_the_ring_s_time_goes_on_behind_the_newest_though_the_clock_was_set_back(tmp_path: Path) -> None:
     desk = Desk(tmp_path / "ring", max_age_s=20.0)
     data = latch(desk, 1)
