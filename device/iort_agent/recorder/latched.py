@@ -30,8 +30,8 @@ FOLDER = "latched"
 SHARE, _MOST_FILES = 0.125, 64
 # Messages that wait for their file: of a topic, in bytes, and for how long.
 _TOGETHER, _TOGETHER_BYTES, _TOGETHER_US = 16, 1_000_000, 1_000_000
-# What is in force and waits in memory for a disk that is full.
-_MEMORY_BYTES = 16_000_000
+# What waits in memory for a disk that is full or fails, of a topic; and what each takes beside its bytes.
+_MEMORY_BYTES, _OVERHEAD = 16_000_000, 1000
 # Keys of a channel's metadata: the publisher, and the size of a message that is gone. That one is kept
 # without its bytes, because what was before it is not in force any more.
 _PUBLISHER, _GONE = "iort_publisher", "iort_gone"
@@ -75,6 +75,7 @@ class LatchedFolder:
         self._sizes: dict[int, int] = {}
         # Messages that are too large, or did not find room in memory or on the disk.
         self.dropped = 0
+        self._failing = False
         for path in sorted(self._folder.glob("*.mcap")):
             self._find(path)
         self._next = 1 + max(self._sizes, default=-1)
@@ -110,6 +111,10 @@ class LatchedFolder:
         mine = [one for one in waiting if one[0] == publisher]
         while len(mine) > 1 and _too_many([len(one[1].data) for one in mine]):
             waiting.remove(mine.pop(0))
+        # Each of a node's restarts may be another publisher.
+        while len(waiting) > 1 and sum(_OVERHEAD + len(one[1].data) for one in waiting) > _MEMORY_BYTES:
+            waiting.pop(0)
+            self.dropped += 1
 
     def tick(self, now_us: int, since_us: int, *, flush: bool = False) -> list[SegmentFile]:
         """Write what has waited, or all; the files to be synced. ``since_us`` is the ring's begin."""
@@ -119,9 +124,11 @@ class LatchedFolder:
                 try:
                     files.append(self._write(waiting))
                 except OSError as error:
-                    # It stays in memory, and is tried again.
-                    _log.debug("ring: %s: %s", self._folder, error.strerror or error)
+                    # They stay in memory, and are tried again.
+                    level, self._failing = logging.DEBUG if self._failing else logging.WARNING, True
+                    _log.log(level, "latched messages: %s: %s", self._folder, error.strerror or error)
                     continue
+                self._failing = False
                 del self._waiting[topic]
         if files:
             self._bound(since_us)
