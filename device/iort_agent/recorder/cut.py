@@ -240,7 +240,7 @@ def _about(incident: Incident, account: Account, losses: Losses) -> Mapping[str,
         "ring_from_us": str(incident.ring_from_us),
         "ring_to_us": str(incident.ring_to_us),
         "topics": json.dumps(incident.topics),
-        # The incident that has what was before, with this one's topics, if it was cut already.
+        # The incidents that have what was before, with this one's topics, if they were cut already.
         "follows": incident.follows,
         # Topic -> the latched messages before the window: publisher, and when they came (0: nobody knows).
         "latched": json.dumps(account.latched),
