@@ -175,26 +175,47 @@ def _copied(ring: Source, incident: Incident, writer: Any, account: Account) -> 
     """Copies the messages of the window, a step each."""
     from_us, to_us, wanted = incident.ring_from_us, incident.ring_to_us, incident.topics or None
     # What the ring has not any more of the window is in force, too.
-    since_us = ring.since_us()
-    latched = ring.latched(max(from_us, min(since_us, to_us)), wanted)
+    latched = ring.latched(max(from_us, min(ring.since_us(), to_us)), wanted)
+    there = _those_of_the_window(ring, incident, [message for _, message in latched.messages])
     channels = _Channels(writer, latched.topics)
     messages = ring.read(from_us - SLACK_US, to_us + SLACK_US, wanted)
     first = next(messages, None)
     # rosbags opens what says that it is ROS 2's.
     writer.start(_PROFILES.get(first.channel.encoding, "") if first is not None else "", _LIBRARY)
     for publisher, message in latched.messages:
-        read = message.ring_us >= max(from_us - SLACK_US, since_us)
-        if read and incident.from_us <= message.t_us <= incident.to_us:
-            continue  # it is of the window by its own time
+        if _identity(message) in there:
+            continue
         account.latch(publisher, message)
         _copy(writer, channels, message, max(from_us, message.ring_us))
         yield
     for message in chain([first] if first is not None else [], messages):
-        kept = from_us <= message.ring_us <= to_us or incident.from_us <= message.t_us <= incident.to_us
+        kept = _is_of(incident, message)
         account.take(message, kept=kept, early=message.ring_us < from_us)
         if kept:
             _copy(writer, channels, message, message.ring_us)
         yield
+
+
+def _is_of(incident: Incident, message: RingMessage) -> bool:
+    """Whether a message is of the window: it came in it, or is of it by its own time."""
+    came = incident.ring_from_us <= message.ring_us <= incident.ring_to_us
+    return came or incident.from_us <= message.t_us <= incident.to_us
+
+
+def _identity(message: RingMessage) -> tuple[object, ...]:
+    return message.channel.topic, message.ring_us, message.t_us, message.data
+
+
+def _those_of_the_window(
+    ring: Source, incident: Incident, latched: Sequence[RingMessage]
+) -> Container[tuple[object, ...]]:
+    """Those latched messages that are of the window, too, and that the ring still has."""
+    early_us = incident.ring_from_us - SLACK_US
+    times = [one.ring_us for one in latched if one.ring_us >= early_us and _is_of(incident, one)]
+    if not times:
+        return ()
+    found = ring.read(min(times), max(times), sorted({one.channel.topic for one in latched}))
+    return {_identity(message) for message in found if _is_of(incident, message)}
 
 
 def _copy(writer: Any, channels: _Channels, message: RingMessage, log_us: int) -> None:
@@ -219,7 +240,7 @@ def _about(incident: Incident, account: Account, losses: Losses) -> Mapping[str,
         "ring_from_us": str(incident.ring_from_us),
         "ring_to_us": str(incident.ring_to_us),
         "topics": json.dumps(incident.topics),
-        # The incident that has what was before, with this one's topics, if it was cut already.
+        # The incidents that have what was before, with this one's topics, if they were cut already.
         "follows": incident.follows,
         # Topic -> the latched messages before the window: publisher, and when they came (0: nobody knows).
         "latched": json.dumps(account.latched),

@@ -30,11 +30,11 @@ FOLDER = "latched"
 SHARE, _MOST_FILES = 0.125, 64
 # Messages that wait for their file: of a topic, in bytes, and for how long.
 _TOGETHER, _TOGETHER_BYTES, _TOGETHER_US = 16, 1_000_000, 1_000_000
-# What is in force and waits in memory for a disk that is full.
-_MEMORY_BYTES = 16_000_000
-# Keys of a channel's metadata: the publisher, and the size of a message that is too large. That one is kept
+# What waits in memory for a disk that is full or fails, of a topic; and what each takes beside its bytes.
+_MEMORY_BYTES, _OVERHEAD = 16_000_000, 1000
+# Keys of a channel's metadata: the publisher, and the size of a message that is gone. That one is kept
 # without its bytes, because what was before it is not in force any more.
-_PUBLISHER, _TOO_LARGE = "iort_publisher", "iort_too_large"
+_PUBLISHER, _GONE = "iort_publisher", "iort_gone"
 # A topic's publisher: stream, topic, schema, publisher.
 _Key = Tuple[str, str, str, str]
 
@@ -73,8 +73,9 @@ class LatchedFolder:
         self._waiting: dict[tuple[str, ...], list[tuple[str, RingMessage, bytes]]] = {}
         self._known: list[_Known] = []
         self._sizes: dict[int, int] = {}
-        # Messages that are too large, or did not find room on the disk.
+        # Messages that are too large, or did not find room in memory or on the disk.
         self.dropped = 0
+        self._failing = False
         for path in sorted(self._folder.glob("*.mcap")):
             self._find(path)
         self._next = 1 + max(self._sizes, default=-1)
@@ -89,8 +90,9 @@ class LatchedFolder:
         """When the newest message came, by the ring's time; 0 without one."""
         return self._known[-1].ring_us if self._known else 0
 
-    def put(self, message: RingMessage, publisher: str, *, again: bool) -> None:
-        """Take a message; one that came ``again`` is in force since before it came, if it is not known."""
+    def put(self, message: RingMessage, publisher: str, *, again: bool, gone: bool = False) -> None:
+        """Take a message; one that came ``again`` is in force since before it came, if it is not known. One
+        that is too large, or ``gone``, ends the one before it."""
         digest = _digest(message.data)
         key = _key(message.channel, publisher)
         waiting = self._waiting.setdefault(key[:3], [])
@@ -98,10 +100,10 @@ class LatchedFolder:
         digests = [one.digest for one in same] + [one[2] for one in waiting if one[0] == publisher]
         if digests and (digest in digests if again else digest == digests[-1]):
             return
-        if len(message.data) > self._max_bytes // 2:
+        if gone or len(message.data) > self._max_bytes // 2:
             self.dropped += 1
             channel = message.channel
-            metadata = {**channel.metadata, _TOO_LARGE: str(len(message.data))}
+            metadata = {**channel.metadata, _GONE: str(len(message.data))}
             message = message._replace(channel=channel._replace(metadata=metadata), data=b"")
         if again:
             message = message._replace(ring_us=max((one.ring_us + 1 for one in same), default=0))
@@ -109,6 +111,10 @@ class LatchedFolder:
         mine = [one for one in waiting if one[0] == publisher]
         while len(mine) > 1 and _too_many([len(one[1].data) for one in mine]):
             waiting.remove(mine.pop(0))
+        # Each of a node's restarts may be another publisher.
+        while len(waiting) > 1 and sum(_OVERHEAD + len(one[1].data) for one in waiting) > _MEMORY_BYTES:
+            waiting.pop(0)
+            self.dropped += 1
 
     def tick(self, now_us: int, since_us: int, *, flush: bool = False) -> list[SegmentFile]:
         """Write what has waited, or all; the files to be synced. ``since_us`` is the ring's begin."""
@@ -118,9 +124,11 @@ class LatchedFolder:
                 try:
                     files.append(self._write(waiting))
                 except OSError as error:
-                    # It stays in memory, and is tried again.
-                    _log.debug("ring: %s: %s", self._folder, error.strerror or error)
+                    # They stay in memory, and are tried again.
+                    level, self._failing = logging.DEBUG if self._failing else logging.WARNING, True
+                    _log.log(level, "latched messages: %s: %s", self._folder, error.strerror or error)
                     continue
+                self._failing = False
                 del self._waiting[topic]
         if files:
             self._bound(since_us)
@@ -138,7 +146,7 @@ class LatchedFolder:
             here = {(one.key, one.ring_us, one.digest) for one in chosen if one.file == file}
             for publisher, message, digest in _read(self._path(file), channels):
                 named = (_key(message.channel, publisher), message.ring_us, digest) in here
-                if named and _TOO_LARGE not in message.channel.metadata:
+                if named and _GONE not in message.channel.metadata:
                     found.append((publisher, message))
         found.sort(key=lambda one: one[1].ring_us)
         return Latched(found, frozenset(one.key[1] for one in known))
@@ -173,7 +181,7 @@ class LatchedFolder:
             for publisher, message, _ in waiting:
                 channel = message.channel
                 # A file has one topic's messages of one type.
-                key = publisher, channel.metadata.get(_TOO_LARGE, "")
+                key = publisher, channel.metadata.get(_GONE, "")
                 if key not in named:
                     named[key] = channel._replace(metadata={**channel.metadata, _PUBLISHER: publisher})
                 file.add(named[key], message.seq, message.ring_us, message.t_us, message.data)
@@ -192,7 +200,7 @@ class LatchedFolder:
                 one.channel.encoding == "cdr",
                 one.ring_us,
                 digest,
-                int(one.channel.metadata.get(_TOO_LARGE, len(one.data))),
+                int(one.channel.metadata.get(_GONE, len(one.data))),
                 file,
             )
             for publisher, one, digest in messages

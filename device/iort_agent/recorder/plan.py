@@ -63,7 +63,7 @@ class Incident:
     """What is kept of a window. The window is in the robot's time, and in the ring's, which is never set.
 
     ``budgets`` are the bytes a day of its triggers, which may be changed or removed meanwhile. ``told`` is
-    the state that the queue on disk has for certain, and ``follows`` the incident that has what was before.
+    the state that the queue on disk has for certain, and ``follows`` the incidents that have what was before.
     """
 
     id: str
@@ -214,7 +214,7 @@ class Plan:
                 continue
             begin_us = incident.ring_from_us
             if known != incident.id and from_us <= begin_us <= to_us < incident.ring_to_us:
-                incident.follows = known
+                incident.follows = ", ".join(filter(None, (incident.follows, known)))
                 incident.from_us += to_us + 1 - begin_us
                 incident.ring_from_us = to_us + 1
 

@@ -30,7 +30,7 @@ from iort_agent.recorder.folder import EVERY, RESTART, SLACK_US, Drop, RingFolde
 from iort_agent.recorder.latched import SHARE, Latched, LatchedFolder
 from iort_agent.recorder.ledger import DISK, ERROR, MEMORY, Counts, Ledger, Topic, fits
 from iort_agent.recorder.segment import RingChannel, RingMessage, Segment, read_segment, require_mcap
-from iort_agent.recorder.writer import AGAIN, RingWriter
+from iort_agent.recorder.writer import AGAIN, GONE, RingWriter
 from iort_agent.sources import Emit
 from iort_agent.sources.intake import Selected
 from iort_contract.catalog.streams import TYPES_STREAM
@@ -161,8 +161,10 @@ class Ring:
                     topic.seq = seq + 1
                     if full:
                         self._ledger.drop(topic, MEMORY, ring_us)
-                if full:
+                if full and (latched_by is None or again):
                     return
+                if full:
+                    seq, payload, size = GONE, b"", _OVERHEAD
                 self._bytes += size
                 self._queue.append((topic, seq, ring_us, t_us, payload, latched_by, size))
                 hurry = self._bytes > self._hurry_bytes

@@ -22,8 +22,9 @@ CHUNK_S, CHUNK_BYTES = 0.3, 1024 * 1024
 _BOUNDS_S = 1.0
 # Files that wait for their sync are open.
 _MOST_UNSYNCED = 32
-# The number of a latched message that came again: it is not a new one.
-AGAIN = -1
+# The numbers of a latched message that came again, which is not a new one, and of one that the memory had no
+# room for: what was before it is not in force any more.
+AGAIN, GONE = -1, -2
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -69,8 +70,8 @@ class RingWriter:
                 topic.channel = ros_channel(topic.stream, topic.kind, self._run)
         if latched_by is not None:
             message = RingMessage(topic.channel, max(0, seq), ring_us, t_us, payload)
-            self._latched.put(message, latched_by, again=seq == AGAIN)
-            if seq == AGAIN:
+            self._latched.put(message, latched_by, again=seq == AGAIN, gone=seq == GONE)
+            if seq < 0:
                 return
         if self._stopped:
             with self._ledger.lock:

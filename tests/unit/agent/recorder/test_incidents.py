@@ -530,6 +530,11 @@ def test_one_that_is_merged_with_an_earlier_window_follows_nothing_any_more(tmp_
     late = one("b" * 16, 15, 30)
     plan.follow(late)
     assert (late.follows, late.ring_from_us) == ("a" * 16, 20 * S + 1)
+    plan.note_cut(one("d" * 16, 18, 25))
+    plan.follow(late)
+    assert (late.follows, late.ring_from_us) == (f"{'a' * 16}, {'d' * 16}", 25 * S + 1), (
+        "the first has 15 to 18"
+    )
     # It could not be cut, and was merged.
     late.merge(one("c" * 16, 5, 31))
     plan.follow(late)

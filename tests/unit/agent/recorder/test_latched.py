@@ -94,6 +94,25 @@ def test_what_is_in_force_comes_first_though_the_ring_has_it_no_more(tmp_path: P
     desk.ring.close()
 
 
+@pytest.mark.parametrize("late_us", [0, 30_000])
+def test_what_the_ring_begins_with_is_there_once(tmp_path: Path, late_us: int) -> None:
+    """It is the first message, or was fetched a little after the first one; its own stamp is old."""
+    desk = Desk(tmp_path / "ring")
+    desk.pass_s(5)
+    if late_us:
+        desk.imu(0, 1)
+    message = RosMessage(body(1), MAP, latched_by="/a", arrival_us=desk.clock.now_us() - late_us)
+    desk.emit("map", T0 - 3600 * S, message)
+    desk.pass_s(2)
+    for i in range(15):
+        desk.imu(i, 1)
+        desk.pass_s(1)
+    file = cut_of(desk, T0, desk.ring.now_us())
+    assert [data for _, _, data in file.messages["/map"]] == [body(1)]
+    assert file.account["/map"] == {"stream": "map", "messages": 1, "missing": 0}
+    desk.ring.close()
+
+
 def test_a_window_of_the_past_has_what_was_in_force_then(tmp_path: Path) -> None:
     desk = Desk(tmp_path / "ring")
     old = latch(desk, 1)
@@ -293,6 +312,7 @@ def test_a_write_that_fails_is_tried_again(tmp_path: Path, monkeypatch: pytest.M
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
         data = latch(desk, 1)
+        desk.pass_s(3)
         assert desk.ring.latched(2**62).messages == []
     desk.pass_s(3)
     assert [message.data for _, message in desk.ring.latched(2**62).messages] == [data]
@@ -339,6 +359,39 @@ def test_one_that_is_too_large_ends_the_one_before(tmp_path: Path, kind: RosType
         assert ring.latched(2**62).messages == [], "what is told is not what held before"
         assert [message.data for _, message in ring.latched(then_us).messages] == [old]
     again.ring.close()
+
+
+def test_one_that_the_memory_has_no_room_for_ends_the_one_before(tmp_path: Path) -> None:
+    desk = Desk(tmp_path / "ring", memory_mb=1.0)
+    latch(desk, 1)
+    other = latch(desk, 1, "/b")
+    desk.imu(0, 40, 32_000)
+    latch(desk, 2, size=32_000)
+    desk.pass_s(3)
+    assert desk.ring.counts()["map"].dropped == {"memory": 1}
+    assert [message.data for _, message in desk.ring.latched(2**62).messages] == [other]
+    newest = latch(desk, 3)
+    desk.pass_s(3)
+    assert [message.data for _, message in desk.ring.latched(2**62).messages] == [other, newest]
+    desk.ring.close()
+
+
+def test_a_folder_that_is_gone_is_told_once_and_takes_little_memory(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    desk = Desk(tmp_path / "ring", memory_mb=1000.0)
+    folder = tmp_path / "ring" / FOLDER
+    folder.rmdir()
+    # A node that begins again and again has another name each time.
+    sent = [latch(desk, n, f"/map_{n}", size=1_600_000) for n in range(15)]
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == [
+        f"latched messages: {folder}: No such file or directory"
+    ]
+    assert desk.ring.report()["latched_dropped"] == 6
+    folder.mkdir()
+    desk.pass_s(3)
+    assert [message.data for _, message in desk.ring.latched(2**62).messages] == sent[6:]
+    desk.ring.close()
 
 
 def test_the_ring_s_time_goes_on_behind_the_newest_though_the_clock_was_set_back(tmp_path: Path) -> None:
