@@ -367,8 +367,9 @@ def test_nonfinite_values_are_counted_in_the_view() -> None:
 def test_columns_beside_messages_are_part_of_their_samples() -> None:
     raws = [u32(0) + u32(0), u32(1) + text("a") + u32(0)]
     batch = batch_of(NAMES, raws, {"data.key": ["k", None], "data.at": [0, 4]})
-    found, messages = messages_of(encode_batch(batch), {})
-    assert found.columns == {"names.0": [None, "a"], "data.key": ["k", None], "data.at": [0, 4]}
+    beside, messages = messages_of(encode_batch(batch), {})
+    assert beside.columns == {"data.key": ["k", None], "data.at": [0, 4]}
+    assert decode_batch(encode_batch(batch)).columns == {"names.0": [None, "a"], **beside.columns}
     assert list(messages.raw) == raws
     # Numeric messages, too.
     numbers = batch_of(FLAT, [flat()], {"note": ["n"]})
