@@ -133,6 +133,6 @@ def _messages(folder: Path) -> dict[str, list[int]]:
 SECTION = Declared(
     "the import of a bag into the archive, beside rosbags",
     run,
-    (Option("MEGABYTES", int, 200, "size of the bag, about"),),
+    (Option("MEGABYTES", int, 500, "size of the bag, about"),),
     Report("import", "Importing recordings", "make bench ONLY=import"),
 )
