@@ -370,3 +370,15 @@ def test_what_an_address_says_in_vain_is_told(open_page, any_past):
             page.get_by_text(reason).wait_for()
     page.goto(f"{any_past}#/alarms")
     until(lambda: not page.get_by_text("Ignored in the address").is_visible(), "a good address")
+
+
+def test_the_range_that_is_shown_opens_in_foxglove(open_page, server):
+    page = open_page(f"{server.url}#/history/car?{FIRST}", timezone_id="UTC")
+    page.get_by_role("button", name="Open this range in Foxglove").click()
+    dialog = page.get_by_role("dialog", name="Open in Foxglove")
+    command = "iort bridge car --from 2023-11-14T22:13:20.000Z --to 2023-11-14T22:14:19.981Z"
+    assert dialog.locator("code").inner_text() == command
+    link = dialog.get_by_role("link", name="Foxglove on this computer").get_attribute("href")
+    assert link == "foxglove://open?ds=foxglove-websocket&ds.url=ws%3A%2F%2F127.0.0.1%3A8765%2F"
+    dialog.get_by_role("button", name="Close").click()
+    until(lambda: page.get_by_role("dialog").count() == 0, "the end of the dialog")

@@ -52,6 +52,10 @@ def test_incidents_are_listed_in_their_newest_state_and_downloaded(open_page, la
     loading.value.save_as(tmp_path / "file")
     assert loading.value.suggested_filename == "hardbrake-0000000000000001.mcap"
     assert (tmp_path / "file").read_bytes() == b"messages"
+    page.get_by_role("button", name="Open the incident hardbrake in Foxglove").click()
+    dialog = page.get_by_role("dialog", name="Open in Foxglove")
+    assert dialog.locator("code").inner_text() == "iort bridge --incident 0000000000000001"
+    dialog.get_by_role("button", name="Close").click()
     lab.refuses = True
     button.click()
     until(lambda: "not in the bucket any more" in listed.first.inner_text(), "the reason")
