@@ -6,12 +6,13 @@ import csv
 import functools
 import math
 import re
+import threading
 
 import pytest
 
 from iort_contract.track import Track
 from iort_station.page.answers import answers
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 from tests.browser import drawn, plain
 from tests.unit.station.data.test_runs import driven_cloud
 from tests.web.cars import GAIN
@@ -130,6 +131,24 @@ def test_the_past_opens_with_the_way_of_the_car_in_the_colours_of_its_speed(show
     assert "fields=map:pose," in page.url
 
 
+def test_a_range_that_is_chosen_before_the_fields_are_known_gets_its_way_later(open_page, serve, past):
+    known, fields = threading.Event(), past.answers["fields"]
+
+    def later(asked):
+        known.wait(GUARD_S)
+        return fields(asked)
+
+    past.answers["fields"] = later
+    page = open_page(f"{serve(answers=past.answers).url}#/history/car?{RANGE}", timezone_id="UTC")
+    page.fill("#from", "2023-11-14 22:13:20")
+    page.fill("#to", "2023-11-14 22:14:00")
+    page.get_by_role("button", name="Load", exact=True).click()
+    loaded(page)
+    assert page.locator(MAP).count() == 0
+    known.set()
+    until(lambda: page.locator(MAP).count() == 1, "the way")
+
+
 def test_pointing_at_the_way_moves_the_playhead_and_the_playhead_the_car(show):
     page = show("map:pose:speed,speed")
     scrub = page.locator(".scrub")
@@ -211,8 +230,9 @@ def test_fields_of_several_streams_share_a_chart_and_its_axis_of_time(show, past
     chart = page.locator("section[aria-label='Speed · X, pose']")
     until(chart.is_visible, "both lines")
     assert "fields=speed~pose/x" in page.url
-    assert {stream for stream, _ in past.asked} == {"vesc", "pose"}
+    until(lambda: {stream for stream, _ in past.asked} == {"vesc", "pose"}, "the other stream")
     loaded(page)
+    until(lambda: chart.locator(".reading").count() == 2, "its line")
     readings = chart.locator(".reading")
     assert [re.sub(r"[\d.\-]+", "", plain(text)).split() for text in readings.all_inner_texts()] == [
         ["Speed", "m/s"],

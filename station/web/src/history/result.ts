@@ -237,13 +237,14 @@ export class Result {
     );
     const xy = x && y ? [[xyKey(x, y), "Field over field"] as const] : [];
     const tables = [...all.keys()].map((stream) => [rowsKey(stream), `Table of ${stream}`] as const);
-    const fields = [...all].filter(([stream]) => stream !== past.main);
-    return new Map([
-      ["Panels", [...maps, ...xy, ...tables]],
-      ...fields.map(
-        ([stream, keys]) => [stream, keys.map((key) => [key, past.spec(key).label] as const)] as const,
-      ),
-    ] as const) as Map<string, (readonly [string, string])[]>;
+    const groups = new Map<string, (readonly [string, string])[]>([["Panels", [...maps, ...xy, ...tables]]]);
+    for (const [stream, keys] of all)
+      if (stream !== past.main)
+        groups.set(
+          stream,
+          keys.map((key) => [key, past.spec(key).label] as const),
+        );
+    return groups;
   }
 
   /** The pointer has left the panels. */

@@ -187,8 +187,7 @@ export class HistoryView implements View<RouteTo<"history">> {
   /** Find the robot's streams and runs, and show what the address says, or the newest. */
   private async enter(robot: string, query: Query<"history">): Promise<void> {
     const runs = this.findRuns();
-    // Without it there are only the fields of the main stream.
-    const fields = ask<FieldsAnswer>("fields", { robot }).catch(() => undefined);
+    const fields = this.findFields(robot);
     this.note.set("Looking for what is stored …");
     await this.loading.run(
       async (signal) => {
@@ -209,12 +208,21 @@ export class HistoryView implements View<RouteTo<"history">> {
         this.result.at = readTime(query.at);
         const range = readRange(query.from, query.to);
         if (!range) await runs;
-        this.known = (await fields)?.streams ?? {};
+        await fields;
         signal.throwIfAborted();
         this.go(range ?? this.newest());
       },
       (reason) => this.note.set(reason),
     );
+  }
+
+  /** Find the fields of the robot's streams; without them there are only those of the main one. */
+  private async findFields(robot: string): Promise<void> {
+    const { streams } = await ask<FieldsAnswer>("fields", { robot }).catch(() => ({ streams: {} }));
+    if (robot !== this.robot) return;
+    this.known = streams;
+    // The viewer may have chosen a range meanwhile.
+    if (this.drives.size > 0 && this.lacking().length > 0) void this.load(this.range!, this.drives);
   }
 
   /** List the runs, or older ones. Without them the view still shows ranges. */
@@ -370,6 +378,8 @@ export class HistoryView implements View<RouteTo<"history">> {
         else this.result.set(past, range);
         const after_s = (performance.now() - began) / 1000;
         this.note.set(drive.samples === 0 ? this.nothing() : about(drive, range, after_s));
+        // The fields of the streams came meanwhile, or other panels.
+        if (this.lacking().length > 0) void this.load(range, there);
       },
       (reason) => this.note.set(reason),
     );
