@@ -24,14 +24,16 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
+from iort_contract.archive import HOUR, JOIN, TASK
 from iort_contract.dynamodb import starting_between
 from iort_contract.recordings.rosbag import Recording, Unread
 from iort_contract.recordings.scan import Scan
 from iort_contract.ros.message import RosMessage
-from iort_contract.tables import DEFAULT_RETENTION_DAYS, EXPIRES_S, RECEIVED_MS
+from iort_contract.tables import DEFAULT_RETENTION_DAYS, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_station import data
 from iort_station.cloud import EMBEDDED, Cloud
-from iort_station.data.recorded import Recorded, telemetry_table, topic_of
+from iort_station.cloud import invoke as invoke_function
+from iort_station.data.recorded import Recorded, archive_of, telemetry_table, topic_of
 from iort_station.fleet import robots
 from iort_station.imports.choice import Choice
 from iort_station.imports.plan import check, look
@@ -184,6 +186,25 @@ def test_a_recent_drive_goes_into_the_table(
     archive.run(cloud, topic_of(cloud, robot, "vesc"))
     archive.wait(cloud, lambda _left: None)
     whole(cloud, robot, tmp_path, path)
+
+
+def test_the_archive_joins_imported_hours_to_their_day(
+    embedded: EmbeddedCloud, importer: tuple[str, Iort], tmp_path: Path
+) -> None:
+    (robot, iort), cloud = importer, embedded.cloud
+    edge_ns = -(-fresh_ns() // 3_600_000_000_000) * 3_600_000_000_000
+    path = made(tmp_path, "mcap", start_ns=edge_ns - 2_000_000_000)
+    iort("import", path, robot)
+    whole(cloud, robot, tmp_path, path)
+    rows = list(archive_of(cloud, topic_of(cloud, robot, "vesc")).rows())
+    assert [row.key[-10:] for row in rows] == ["12.parquet", "13.parquet"]
+    for stream in COUNTS:
+        task = {TASK: JOIN, TOPIC: topic_of(cloud, robot, stream), HOUR: rows[0].hour[:10]}
+        invoke_function(cloud, "archive", "ArchiveFunction", json.dumps(task).encode(), "the archive")
+    rows = list(archive_of(cloud, topic_of(cloud, robot, "vesc")).rows())
+    assert {row.key[-11:] for row in rows} == {"day.parquet"}
+    whole(cloud, robot, tmp_path, path)
+    assert iort_of(embedded, "archive", "verify", robot).exit_code == 0
 
 
 def test_an_interrupted_import_goes_on(
