@@ -40,6 +40,8 @@ _AHEAD_MESSAGES, _AHEAD_BYTES = 4096, 64 * 1024 * 1024
 _AT_ONCE = 512
 # A pause of reading that clients are told of.
 _BUFFERING_S = 0.25
+# A state overtakes messages in a client's queue, so the end is told so long after the last one.
+_SETTLES_S = 0.25
 # What is sent before its time while paused comes at most so long after the playhead.
 _SHOWN_NS = 1_000_000_000
 # Clients are told the time so often.
@@ -93,7 +95,7 @@ class Player:
         # What was sent before its time, by topic.
         self._shown: dict[int, int] = {}
         self._starved_s: float | None = None
-        self._told_s = 0.0
+        self._told_s = self._sent_s = 0.0
         # Somebody has just come, and does not know the state.
         self._tells = False
         self._threads = [
@@ -208,9 +210,12 @@ class Player:
             else:
                 due.append(message)
         self._changed.notify_all()
-        if self._at_ns >= self._source.end_ns:
+        if due:
+            self._sent_s = self._at_s
+        ends = self._at_ns >= self._source.end_ns
+        if ends and self._at_s - self._sent_s >= _SETTLES_S:
             self._status = PlaybackStatus.Ended
-        elif self._at_ns < self._read_ns or not self._subscribed:
+        elif ends or self._at_ns < self._read_ns or not self._subscribed:
             self._starved_s, self._status = None, PlaybackStatus.Playing
         elif self._starved_s is None:
             self._starved_s = self._at_s
