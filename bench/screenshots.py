@@ -20,7 +20,7 @@ from typing import Any
 from bench.load.cars import SimulatedCar, drive
 from bench.proof.fleet import drive_of
 from bench.proof.judging import analysed
-from iort_agent.sources.sim import HALL
+from iort_agent.sources.sim.driver import HALL
 from iort_agent.sources.sim.vehicle import VehicleConfig
 from iort_analysis.evaluation import evaluate
 from iort_analysis.process import analyse
