@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import socket
 import ssl
 import sys
 import tempfile
@@ -168,10 +169,15 @@ def _access(
         return Access(host=listen, port=port, origins=origins, context=tls, key=key, admits=one_key(key))
     file: Path | None = context.obj.file()
     kept_folder = file.parent if file is not None and (file.parent / VERSION).exists() else None
-    password = Password(kept_folder or kept.bridge())
+    folder = kept_folder or kept.bridge()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    password = Password(folder)
     if new := password.make():
-        remove = "make up-password" if kept_folder else f"rm {kept.bridge()}/page-password"
-        options.say(f"the {first_password(new, remove, sys.stderr)}")
+        if kept_folder:
+            options.say(f"the {first_password(new, 'make up-password', sys.stderr)}")
+        else:
+            known = f"password {new}, shown once" if sys.stderr.isatty() else "password is not shown here"
+            options.say(f"the {known}: remove {folder}/page-password, and the next start makes another")
     pages = kept.page_certificate(kept_folder) if kept_folder else None
     tls = _tls(certificate or pages)
     if tls is None:
@@ -184,6 +190,7 @@ def _access(
         admits=ByPassword(password),
         # Nobody can read it from its hash, so the reader fills it in.
         key="PASSWORD",
+        shown=socket.gethostname() if listen in {"0.0.0.0", "::"} else "",  # noqa: S104 - compared
     )
 
 
