@@ -58,7 +58,7 @@ class Part(NamedTuple):
         return {"from_us": self.first.t_us, "to_us": self.to_us}
 
 
-class _Report(NamedTuple):
+class Report(NamedTuple):
     """The last report of a run, and the batches that have it."""
 
     part: Part
@@ -113,10 +113,19 @@ def runs(
     return {"runs": entries[:count], "older": len(entries) > count, "streams": extents}
 
 
-def reports(cloud: Cloud, robot: str, start_us: int | None, end_us: int | None) -> dict[str, Account]:
-    """The last account in a range of each run that sent one there, by the run's name."""
+def reports(cloud: Cloud, robot: str, start_us: int | None, end_us: int | None) -> dict[str, Report]:
+    """The last report in a range of each run that sent one there, by the run's name."""
     reader = _Reader(cloud, robot, ACCOUNT_STREAM)
-    return {part.last.boot: reader.report(part).account for part in reader.runs(start_us, end_us)}
+    found: dict[str, Report] = {}
+    for part in reader.runs(start_us, end_us):
+        boot = part.last.boot
+        # Runs at the same time come in several parts, the newest first.
+        if boot in found:
+            newest = found[boot]
+            found[boot] = newest._replace(part=newest.part._replace(first=part.first))
+        else:
+            found[boot] = reader.report(part)
+    return found
 
 
 @dataclass(frozen=True)
@@ -159,7 +168,7 @@ def overview(cloud: Cloud, robot: str, *, origin: Origin | None = None) -> list[
     return [described(stream) for stream in streams if stream in answer["streams"]]
 
 
-def _by_run(recorded: Mapping[str, list[Part]], accounts: Mapping[str, _Report]) -> list[Run]:
+def _by_run(recorded: Mapping[str, list[Part]], accounts: Mapping[str, Report]) -> list[Run]:
     """The runs with what each recorded of every stream, in no order."""
     entries = {
         boot: _run(boot, report.part, report)
@@ -184,7 +193,7 @@ def _by_run(recorded: Mapping[str, list[Part]], accounts: Mapping[str, _Report])
     return list(entries.values())
 
 
-def _run(boot: str, part: Part, reported: _Report | None) -> Run:
+def _run(boot: str, part: Part, reported: Report | None) -> Run:
     young = time.time() * 1e6 - part.to_us < SILENT_US
     return {
         **part.extent,
@@ -211,12 +220,12 @@ class _Reader(Recorded):
             yield Part(first, last, self._end_us(last))
             last = before
 
-    def report(self, part: Part) -> _Report:
+    def report(self, part: Part) -> Report:
         """The last report of a run."""
         # An agent that does not batch sends a report in several messages.
         keys = starting_between(part.last.t_us - MAX_BATCH_SPAN_US, part.last.t_us)
         items = chain.from_iterable(self.items(keys, (*ATTRIBUTES, RECEIVED_MS)))
-        return _Report(part, last_of(map(plain, items)).get(part.last.boot, Account()))
+        return Report(part, last_of(map(plain, items)).get(part.last.boot, Account()))
 
     def _first_of(self, last: BatchId) -> tuple[BatchId, BatchId | None]:
         """The first batch of the run of ``last``, and the one before it, of another run."""

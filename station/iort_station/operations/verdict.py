@@ -7,6 +7,7 @@ its edges, and against the accounts of the runs, which tell what followed a run'
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from iort_contract.tables import BATCH
 from iort_station.cloud import Cloud
 from iort_station.data.accounts import SILENT_US, Account
 from iort_station.data.recorded import Recorded
-from iort_station.data.runs import reports
+from iort_station.data.runs import Report, reports
 from iort_station.operations.audit import NOT_ENDED, Audit, RunAudit, audit, headers, shortfalls
 from iort_station.times import iso
 
@@ -111,8 +112,13 @@ def verdict(
         why = (f"the range has more than {most:,} batches: `iort audit` reads any number",)
         return Verdict(**about, word="unknown", why=why, batches=batches, missing=0)
     runs = found.runs
-    told = reports(cloud, robot, first_us, None if last_us is None else last_us + _REPORT_US) if runs else {}
-    reasons = [*_gaps(found, low, high), *_tails(runs, stream, told, low, high)]
+    told = reports(cloud, robot, first_us, None if last_us is None else last_us + _REPORT_US)
+    accounts = {boot: report.account for boot, report in told.items()}
+    reasons = [
+        *_gaps(found, low, high),
+        *_tails(runs, stream, accounts, low, high),
+        *_unseen(found, recorded, told, low, high),
+    ]
     if not runs:
         reasons.append(_Reason(known=False, text=f"nothing of {robot} {stream} is stored"))
     elif before is None and (oldest := min(runs, key=lambda run: run.first_us)).first_seq > 0:
@@ -137,10 +143,11 @@ def verdict(
 
 
 def _untils(runs: Sequence[RunAudit]) -> Iterator[tuple[RunAudit, int]]:
-    """The runs in order of time, each with the time at which the next one begins."""
-    in_time = sorted(runs, key=lambda run: run.first_us)
-    starts = [run.first_us for run in in_time]
-    yield from zip(in_time, [*starts, _ENDLESS_US][1:], strict=True)
+    """The runs, each with the time at which the next one begins after its last batch: one that began before
+    that had a clock that was set back."""
+    starts = [*sorted(run.first_us for run in runs), _ENDLESS_US]
+    for run in runs:
+        yield run, starts[bisect_right(starts, run.last_us)]
 
 
 def _gaps(found: Audit, low_us: int, high_us: int) -> Iterator[_Reason]:
@@ -155,6 +162,42 @@ def _gaps(found: Audit, low_us: int, high_us: int) -> Iterator[_Reason]:
     for lost in found.lost_runs:
         text = f"none of the {lost.batches:,} batches of run {lost.boot[:8]} is stored"
         yield _Reason(known=True, text=text, missing=lost.batches)
+
+
+def _unseen(
+    found: Audit, recorded: Recorded, told: Mapping[str, Report], low_us: int, high_us: int
+) -> Iterator[_Reason]:
+    """The runs that report batches of the stream in the range, and of which no batch was found."""
+    seen = {run.boot for run in found.runs} | {lost.boot for lost in found.lost_runs}
+    for boot, (part, account) in told.items():
+        stated = account.streams.get(found.stream)
+        if boot in seen or stated is None or not stated.next_seq:
+            continue
+        # It began after the runs before it, and at most one report's time before its first report.
+        earlier = [run.last_us for run in found.runs if run.last_us < part.first.t_us]
+        first_us = max([part.first.t_us - _REPORT_US, *earlier])
+        if first_us >= high_us or part.to_us <= low_us:
+            continue
+        name, n = f"run {boot[:8]}", stated.next_seq
+        # Its reports are numbered, so the last one tells how far back it may have begun.
+        keys = starting_between(part.last.t_us - (part.last.seq + 1) * _REPORT_US, part.to_us)
+        if any(_is_of(boot, item) for item in recorded.headers(keys)):
+            yield _Reason(
+                known=False, text=f"{name} recorded at the same time as another, and is not compared"
+            )
+        elif stated.replayed:
+            text = f"none of the {n:,} batches of {name} was found, which played a recording of another time"
+            yield _Reason(known=False, text=text)
+        elif not stated.ended and time.time() * 1e6 - account.received_us < SILENT_US:
+            yield _Reason(known=False, text=f"{name} goes on: the robot may hold its {n:,} batches")
+        else:
+            yield _Reason(known=True, text=f"none of the {n:,} batches of {name} is stored", missing=n)
+
+
+def _is_of(boot: str, item: Mapping[str, Any]) -> bool:
+    with suppress(ContractError):
+        return batch_id(item.get(BATCH, {}).get("S")).boot == boot
+    return False
 
 
 def _tails(

@@ -36,7 +36,7 @@ def report(
     samples = [own, *([SourceAccount("ros", lost).sample()] if lost else [])]
     names = dict.fromkeys(name for sample in samples for name in sample)
     columns = {name: [sample.get(name) for sample in samples] for name in names}
-    item = item_of(Batch(boot, 0, [at + i for i in range(len(samples))], columns), ACCOUNTS)
+    item = item_of(Batch(boot, seq, [at + i for i in range(len(samples))], columns), ACCOUNTS)
     return item | ({"received_ms": {"N": str(received_ms)}} if received_ms else {})
 
 
@@ -136,6 +136,64 @@ def test_the_end_that_a_later_run_names_is_missing_before_it():
     found = word([*run(), *later], told)
     assert (found.word, found.missing) == ("incomplete", 2)
     assert word([*run(), *later], told, START + 101 * S).word == "complete"
+
+
+def test_a_run_of_which_nothing_is_stored_is_missing_where_its_reports_are():
+    """Also if no later run names it, and if it is the only one."""
+    lost = report("1badcafe", START + 200 * S)
+    last = run("2badcafe", START + 390 * S)
+    for batches, told in (
+        (run(), [report(), lost]),
+        ([*run(), *last], [report(), lost, report("2badcafe", START + 400 * S)]),
+        ([], [lost]),
+    ):
+        for start, end in ((None, None), (START + 150 * S, START + 250 * S)):
+            found = word(batches, told, start, end)
+            assert (found.word, found.missing) == ("incomplete", 10)
+            assert "none of the 10 batches of run 1badcafe is stored" in found.why
+        if batches:
+            assert word(batches, told, START, START + 10 * S).word == "complete"
+
+
+def test_a_run_whose_batches_wait_in_the_car_is_unknown():
+    now = NOW_MS * 1000
+    told = [report(), report("1badcafe", now - 9 * S, ended=False, received_ms=NOW_MS)]
+    found = word(run(), told, now - 20 * S, now)
+    assert (found.word, found.missing) == ("unknown", 0)
+    assert found.why == ("run 1badcafe goes on: the robot may hold its 10 batches",)
+
+
+def test_a_report_of_a_run_before_the_range_says_nothing_about_it():
+    # The short run between is the range's neighbour; the report before it is read, its batches are not.
+    between = run("1badcafe", START + 13 * S, 1)
+    later = run("2badcafe", START + 60 * S)
+    told = [
+        report(at=START + 12 * S),
+        report("1badcafe", START + 14 * S, n=1),
+        report("2badcafe", START + 70 * S),
+    ]
+    assert word([*run(), *between, *later], told, START + 30 * S, START + 65 * S).word == "complete"
+
+
+def test_what_followed_a_run_is_missing_although_the_clock_was_set_back_after_it():
+    told = [report(n=15, at=START + 15 * S), report("1badcafe", START + 9 * S, n=3)]
+    found = word([*run(), *run("1badcafe", START + 5 * S, 3)], told, START + 11 * S, START + 13 * S)
+    assert (found.word, found.why) == ("incomplete", ("batches 10 to 14 of run 0badcafe are not stored",))
+
+
+def test_a_run_beside_another_that_is_not_compared_is_unknown():
+    # Its clock was set back, and its batches are before the range's neighbour.
+    beside = run("1badcafe", START + 50 * S)
+    told = [
+        report(n=100, at=START + 100 * S),
+        report("1badcafe", START + 61 * S, ended=False),
+        report("1badcafe", START + 150 * S, n=90, seq=1),
+    ]
+    found = word([*run(n=100), *beside], told, START + 120 * S, START + 130 * S)
+    assert (found.word, found.why) == (
+        "unknown",
+        ("run 1badcafe recorded at the same time as another, and is not compared",),
+    )
 
 
 def test_what_cannot_be_read_is_incomplete_here_and_as_a_reader_found_it():
