@@ -21,8 +21,8 @@ def cache(environment: Mapping[str, str]) -> Path:
 
 
 def check_free(path: Path, *, force: bool) -> None:
-    """Raise `StationError` if there is a file already, unless ``force``."""
-    if path.exists() and not force:
+    """Raise `StationError` if there is a file or a link already, unless ``force``."""
+    if os.path.lexists(path) and not force:
         raise StationError(f"{path} exists: give another --out, or overwrite it with --force")
 
 
@@ -54,7 +54,7 @@ def whole_folder(path: Path, mark: str, kind: str, *, force: bool = False) -> It
     ``mark`` is a file that every ``kind`` has: ``force`` replaces no other folder.
     """
     check_free(path, force=force)
-    if path.exists() and not (path / mark).is_file():
+    if os.path.lexists(path) and not (path / mark).is_file():
         raise StationError(f"{path} is no {kind}: give another --out")
     if not path.parent.is_dir():
         raise StationError(f"{path} must be in a folder that exists")
@@ -62,9 +62,15 @@ def whole_folder(path: Path, mark: str, kind: str, *, force: bool = False) -> It
         # Files in it may have its name.
         part = Path(temporary) / path.name
         yield part
-        if path.exists():
-            path.rename(Path(temporary) / "before")
-        part.rename(path)
+        before = Path(temporary) / "before"
+        try:
+            if path.exists():
+                path.rename(before)
+            part.rename(path)
+        except BaseException:
+            if before.exists() and not path.exists():
+                before.rename(path)
+            raise
 
 
 def write_private(path: Path, content: str | bytes) -> None:

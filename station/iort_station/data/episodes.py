@@ -7,7 +7,7 @@ A step has each field's last value before it, and each camera's last image. Wher
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -239,8 +239,10 @@ def episodes(source: Source, shape: Shape) -> Iterator[Episode]:
         own = [field for field in shape.fields if field.stream == stream]
         block = source.samples(stream, [field.name for field in own])
         for field in own:
-            columns[field] = _held(times, block.times_us, _numbers(field, block))
-            known &= ~np.isnan(columns[field])
+            # What a float32 cannot hold is not known either.
+            with np.errstate(over="ignore"):
+                columns[field] = _held(times, block.times_us, _numbers(field, block)).astype(np.float32)
+            known &= np.isfinite(columns[field])
     for camera in shape.cameras:
         seen = source.samples(camera, ()).times_us
         known &= ~np.isnan(_held(times, seen, np.zeros(len(seen))))
@@ -248,7 +250,7 @@ def episodes(source: Source, shape: Shape) -> Iterator[Episode]:
     for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if end - first >= MIN_S * shape.fps:
             part = slice(first, end)
-            yield Episode(times[part], {name: of[part].astype(np.float32) for name, of in columns.items()})
+            yield Episode(times[part], {name: of[part] for name, of in columns.items()})
 
 
 def _numbers(field: Field, block: Block) -> Column:
@@ -279,7 +281,7 @@ class Frames:
 
     def __init__(self, source: Source, camera: str) -> None:
         self._messages = source.images(camera)
-        self._decoders: dict[str, Images] = {}
+        self._decoders: dict[tuple[str, str], Images] = {}
         self._next: tuple[int, MessageType, bytes] | None = next(self._messages, None)
         self._pixels: Pixels | None = None
         self.damaged = self.not_kept = 0
@@ -292,16 +294,32 @@ class Frames:
             newest, self._next = self._next, next(self._messages, None)
         if newest is not None:
             _, kind, raw = newest
-            if kind.id not in self._decoders:
-                self._decoders[kind.id] = Images(kind.kind, kind.definition)
+            # A topic may change its type, and an incident's file tells only these two of it.
+            type_ = kind.kind, kind.definition
+            if type_ not in self._decoders:
+                self._decoders[type_] = Images(*type_)
             try:
-                pixels = self._decoders[kind.id].pixels(raw)
+                pixels = self._decoders[type_].pixels(raw)
             except StationError:
                 self.damaged += 1
             else:
                 self.not_kept += pixels is None
                 self._pixels = self._pixels if pixels is None else pixels
         return self._pixels
+
+
+def from_images(episode: Episode, cameras: Collection[Frames], fps: int) -> Episode | None:
+    """The episode from the first step with an image of every camera that can be shown; None if that is less
+    than a second."""
+    if not cameras:
+        return episode
+    for step, t_us in enumerate(episode.times_us.tolist()):
+        if all([camera.at(t_us) is not None for camera in cameras]):  # noqa: C419 - each camera must go on
+            if len(episode.times_us) - step < MIN_S * fps:
+                break
+            columns = {name: column[step:] for name, column in episode.columns.items()}
+            return Episode(episode.times_us[step:], columns)
+    return None
 
 
 def usual_fields(cloud: Cloud, robot: str) -> tuple[tuple[Field, ...], tuple[Field, ...]]:

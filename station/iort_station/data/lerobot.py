@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from iort_station.data.episodes import Episode, Field, Frames, Shape, Source, episodes
+from iort_station.data.episodes import Episode, Field, Frames, Shape, Source, episodes, from_images
 from iort_station.data.images import Pixels, resized
 from iort_station.errors import StationError
 from iort_station.output import whole_folder
@@ -31,9 +31,13 @@ from iort_station.output import whole_folder
 VERSION = "v3.0"
 _FILES_A_CHUNK = 1000
 _STATE, _ACTION = "observation.state", "action"
+# A file that no other program's dataset has.
+_OURS = "meta/iort.json"
 _QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 # H.264 plays everywhere; every second frame is a whole one, so that a frame is found fast, as LeRobot has it.
 _CODEC, _OPTIONS = "libx264", {"crf": "23", "g": "2", "preset": "veryfast"}
+# What its encoder takes.
+_LEAST_SIDE, _MOST_SIDE = 16, 16_384
 _SCALARS = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -48,18 +52,21 @@ _Histogram = NDArray[np.int64]
 @dataclass
 class Written:
     """What was written. ``not_kept`` are images whose content the robot has not kept, ``damaged`` those that
-    cannot be shown, ``resized`` those of another size than their camera's first."""
+    cannot be shown, ``resized`` those of another size than their camera's first. ``left_out`` counts sources
+    that could not be read or lack a field or a camera; ``reason`` says why of the first."""
 
     episodes: int = 0
     frames: int = 0
     not_kept: int = 0
     damaged: int = 0
     resized: int = 0
+    left_out: int = 0
+    reason: str = ""
 
 
 def write(
     out: Path,
-    sources: Iterable[Source],
+    sources: Iterable[Source | StationError],
     shape: Shape,
     *,
     task: str,
@@ -70,24 +77,39 @@ def write(
 ) -> Written:
     """Write the episodes of sources as a dataset, which appears once it is whole.
 
-    ``task`` says in words what the robot did. Raises `StationError` if there is no episode, if ``out`` exists
-    and is no dataset, or exists without ``force``; and for fields and images as `episodes` does.
+    ``task`` says in words what the robot did. A source that lacks a field or a camera is left out, and
+    counted, and so is an error in its place. Raises `StationError` if there is no episode, if ``out`` exists
+    and is no dataset that was written here, or exists without ``force``; and for images of another type.
     """
     if shape.cameras:
         _av()
-    with whole_folder(out, "meta/info.json", "dataset of LeRobot", force=force) as folder:
+    with whole_folder(out, _OURS, "dataset of `iort export`", force=force) as folder:
         dataset = _Dataset(folder, shape, task, robot, units)
         for source in sources:
-            frames = {camera: Frames(source, camera) for camera in shape.cameras}
-            for episode in episodes(source, shape):
-                dataset.add(episode, frames, source.about)
-                progress(len(episode.times_us), int(episode.times_us[-1]))
+            try:
+                if isinstance(source, StationError):
+                    raise source
+                parts = episodes(source, shape)
+                frames = {camera: Frames(source, camera) for camera in shape.cameras}
+                # All fields are read before the first episode.
+                first = next(parts, None)
+            except StationError as error:
+                dataset.written.left_out += 1
+                dataset.written.reason = dataset.written.reason or str(error)
+                continue
+            for part in () if first is None else chain((first,), parts):
+                episode = from_images(part, frames.values(), shape.fps)
+                if episode is not None:
+                    dataset.add(episode, frames, source.about)
+                progress(len(part.times_us), int(part.times_us[-1]))
             dataset.written.damaged += sum(each.damaged for each in frames.values())
             dataset.written.not_kept += sum(each.not_kept for each in frames.values())
         if not dataset.written.episodes:
-            raise StationError(
-                f"no second has all of {', '.join(map(str, shape.fields))}; {out} is not written"
-            )
+            if dataset.written.reason:
+                raise StationError(f"{dataset.written.reason}; {out} is not written")
+            wanted = ", ".join(map(str, shape.fields))
+            images = f" and an image of {', '.join(shape.cameras)} that can be shown" if shape.cameras else ""
+            raise StationError(f"no second has all of {wanted}{images}; {out} is not written")
         dataset.finish()
     return dataset.written
 
@@ -98,7 +120,7 @@ class _Dataset:
         self.written = Written()
         self._rows: list[dict[str, Any]] = []
         self._about: list[Mapping[str, Any]] = []
-        self._columns: dict[str, list[NDArray[Any]]] = {}
+        self._statistics: dict[str, list[dict[str, list[float]]]] = {}
         self._videos: dict[str, _Camera] = {f"observation.images.{name}": _Camera() for name in shape.cameras}
 
     def add(self, episode: Episode, frames: Mapping[str, Frames], about: Mapping[str, Any]) -> None:
@@ -138,8 +160,8 @@ class _Dataset:
             row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": n / self._shape.fps}
         for name, each in statistics.items():
             row |= {f"stats/{name}/{statistic}": value for statistic, value in each.items()}
-        for name, column in columns.items():
-            self._columns.setdefault(name, []).append(column)
+        for name in columns:
+            self._statistics.setdefault(name, []).append(statistics[name])
         self._rows.append(row)
         first, last = int(episode.times_us[0]), int(episode.times_us[-1])
         self._about.append({"episode_index": number, "from_us": first, "to_us": last, **about})
@@ -156,7 +178,7 @@ class _Dataset:
         pq.write_table(
             pa.Table.from_pylist(self._rows), self._path("meta/episodes/chunk-000/file-000.parquet")
         )
-        statistics = {name: _statistics(np.concatenate(parts)) for name, parts in self._columns.items()}
+        statistics: dict[str, Any] = {name: _joined(parts) for name, parts in self._statistics.items()}
         for key, camera in self._videos.items():
             statistics[key] = _of_histogram(camera.histogram, self.written.frames)
             self.written.resized += camera.resized
@@ -183,7 +205,7 @@ class _Dataset:
             },
         )
         units = {str(name): self._units.get(name, "") for name in self._shape.fields}
-        self._json("meta/iort.json", {"units": units, "episodes": self._about})
+        self._json(_OURS, {"units": units, "episodes": self._about})
 
     def _features(self) -> dict[str, Any]:
         named = {_STATE: self._shape.state, _ACTION: self._shape.action}
@@ -214,13 +236,12 @@ class _Camera:
     histogram: _Histogram = field(default_factory=lambda: np.zeros((3, 256), dtype=np.int64))
 
     def encode(self, path: Path, images: Iterator[Pixels | None], fps: int) -> _Histogram:
-        """Write an image a step, and return where their brightness lies; raises `StationError` if no image
-        can be shown."""
+        """Write an image a step, the first of which is one, and return where their brightness lies."""
         first = next(images)
-        if first is None:
-            raise StationError(f"no image of {path.parent.parent.name} can be shown")
+        assert first is not None  # an episode begins with an image
         if self.size is None:
-            self.size = first.shape[1] // 2 * 2, first.shape[0] // 2 * 2
+            height, width = (min(max(side // 2 * 2, _LEAST_SIDE), _MOST_SIDE) for side in first.shape[:2])
+            self.size = width, height
         counts = np.zeros((3, 256), dtype=np.int64)
         with _av().open(str(path), "w") as container:
             stream = container.add_stream(_CODEC, rate=fps, options=_OPTIONS)
@@ -291,6 +312,22 @@ def _statistics(column: NDArray[Any]) -> dict[str, list[float]]:
         "std": rows.std(axis=0).tolist(),
         "count": [len(rows)],
         **{f"q{round(q * 100):02d}": of.tolist() for q, of in zip(_QUANTILES, quantiles, strict=True)},
+    }
+
+
+def _joined(parts: Sequence[Mapping[str, list[float]]]) -> dict[str, list[float]]:
+    """The statistics of several episodes as one, as LeRobot's `aggregate_stats` joins them: quantiles are
+    their means over the frames."""
+    of = {name: np.array([part[name] for part in parts], dtype=np.float64) for name in parts[0]}
+    counts = of.pop("count")
+    mean = (of["mean"] * counts).sum(axis=0) / counts.sum()
+    spread = of["std"] ** 2 + (of["mean"] - mean) ** 2
+    return {
+        **{name: ((each * counts).sum(axis=0) / counts.sum()).tolist() for name, each in of.items()},
+        "min": of["min"].min(axis=0).tolist(),
+        "max": of["max"].max(axis=0).tolist(),
+        "std": np.sqrt((spread * counts).sum(axis=0) / counts.sum()).tolist(),
+        "count": [int(counts.sum())],
     }
 
 

@@ -107,6 +107,9 @@ def export(
     tell(counts, f"{out}: {written.episodes:,} episodes of {written.frames:,} frames", as_json=as_json)
     options.say(f"state: {', '.join(map(str, state))}")
     options.say(f"action: {', '.join(map(str, action))}")
+    if written.left_out:
+        kind = learning.episodes or "drives"
+        options.say(f"{written.left_out:,} {kind} are left out; the first: {written.reason}")
     if written.not_kept:
         options.say(
             f"the robot has not kept {written.not_kept:,} images: the ones before stand in their places. "
@@ -130,8 +133,8 @@ def _unit(cloud: Cloud, robot: str, field: Field) -> str:
 
 def _sources(
     cloud: Cloud, robot: str, within: Range, kind: str, streams: Sequence[str], folder: Path
-) -> Iterator[Source]:
-    """What becomes episodes, in order of time; raises `StationError` if there is nothing."""
+) -> Iterator[Source | StationError]:
+    """What becomes episodes, in order of time, or why it cannot; raises `StationError` for nothing at all."""
     from iort_station.data.episodes import Kept, Stored  # noqa: PLC0415 - as above
     from iort_station.data.findings import drives  # noqa: PLC0415 - as above
     from iort_station.data.incidents import incidents  # noqa: PLC0415 - as above
@@ -172,7 +175,11 @@ def _sources(
         for one in reversed(uploaded):
             file = files.stored(cloud, one.incident.key)
             if file is None or file.robot != robot:
-                raise StationError(f"incident {one.incident.id} is not in the bucket any more")
+                yield StationError(f"incident {one.incident.id} is not in the bucket any more")
+                continue
             path = files.download(cloud, file, folder / one.incident.id)
-            yield Kept(path, vehicle, {"robot": robot, "incident": one.incident.id})
+            try:
+                yield Kept(path, vehicle, {"robot": robot, "incident": one.incident.id})
+            except StationError as error:
+                yield error
             path.unlink()

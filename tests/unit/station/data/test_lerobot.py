@@ -136,6 +136,72 @@ def test_images_of_another_size_are_resized_and_damaged_ones_counted(tmp_path):
     assert len(brightness(out / "videos/observation.images.camera/chunk-000/file-000.mp4")) == 20
 
 
+def test_an_episode_begins_with_the_first_image_that_can_be_shown(tmp_path):
+    later = recorded(seconds=3, images=[b"no image", b"", *[picture(100)] * 13])
+    none = recorded(seconds=3, images=[b"no image"] * 15)
+    short = recorded(seconds=2, images=[*[b"no image"] * 8, picture(100), picture(100)])
+    out, counts = written(tmp_path, later, none, short, recorded(seconds=2))
+    assert (counts.episodes, counts.frames, counts.not_kept, counts.damaged) == (2, 26 + 20, 1, 1 + 15 + 8)
+    table = pq.read_table(out / "data/chunk-000/file-000.parquet")
+    assert table["observation.state"].to_pylist() == [2 * i for i in range(4, 30)]
+    shown = brightness(out / "videos/observation.images.camera/chunk-000/file-000.mp4")
+    assert np.abs(np.array(shown) - 100).max() < 4
+    assert len(shown) == 26
+
+
+@pytest.mark.parametrize("size", [(1, 1), (20_000, 2), (3, 500)])
+def test_an_image_of_a_size_that_no_video_has_is_resized(tmp_path, size):
+    out, counts = written(tmp_path, recorded(seconds=2, images=[picture(100, size)] * 10))
+    assert (counts.frames, counts.resized) == (20, 10)
+    shown = brightness(out / "videos/observation.images.camera/chunk-000/file-000.mp4")
+    assert np.abs(np.array(shown) - 100).max() < 4
+
+
+def test_a_camera_whose_type_changes_is_shown_whole(tmp_path):
+    source = recorded(seconds=2, images=[picture(100)] * 5)
+    definition, md5 = ROS1.generate_msgdef(RAW)
+    raw = RosType("/camera", "sensor_msgs/Image", md5, definition)
+    declared = MessageType("camera", raw.topic, raw.name, md5, definition).sample()
+    topics = {name: build_topic(RECORD, "car", name) for name in ("types", "camera")}
+    types = Batch("1badcafe", 0, [START], {name: [value] for name, value in declared.items()})
+    source.cloud.table.put(TELEMETRY, item_of(types, topics["types"]))
+    for i in range(5):
+        messages = Messages(raw.id, raw.layout, [raw_image("mono8", [200] * 64 * 48, 64, 48)])
+        batch = Batch("1badcafe", i, [START + SECOND + i * 200_000], {}, 0, messages)
+        source.cloud.table.put(TELEMETRY, item_of(batch, topics["camera"]))
+    out, counts = written(tmp_path, source)
+    assert (counts.frames, counts.damaged) == (20, 0)
+    shown = brightness(out / "videos/observation.images.camera/chunk-000/file-000.mp4")
+    assert np.abs(np.array(shown) - ([100] * 10 + [200] * 10)).max() < 4
+
+
+def test_what_a_float32_cannot_hold_is_not_known(tmp_path):
+    speeds = {2: [1e300] * 20, 3: [float("inf")] * 20}
+    out, counts = written(tmp_path, recorded(seconds=6, speeds=speeds))
+    assert (counts.episodes, counts.frames) == (2, 40)
+    assert "Infinity" not in (out / "meta/stats.json").read_text()
+
+
+def test_the_statistics_of_all_episodes_are_those_of_their_frames(tmp_path):
+    out, _ = written(tmp_path, recorded(seconds=3), recorded(seconds=2), recorded(seconds=5))
+    files = sorted((out / "data").rglob("*.parquet"))
+    values = np.concatenate([pq.read_table(path)["action"].to_pylist() for path in files])
+    found = json.loads((out / "meta/stats.json").read_text())["action"]
+    for name in ("min", "max", "mean", "std"):
+        assert np.allclose(found[name], getattr(np, name)(values, axis=0))
+    assert found["count"] == [100]
+    # As LeRobot joins them: the mean of the episodes' medians over the frames.
+    medians = [np.median(pq.read_table(path)["action"].to_pylist(), axis=0) for path in files]
+    assert np.allclose(found["q50"], np.average(medians, axis=0, weights=[30, 20, 50]))
+
+
+def test_a_source_that_cannot_be_read_is_left_out_and_said(tmp_path):
+    lost = StationError("incident f00d is not in the bucket any more")
+    out, counts = written(tmp_path, lost, recorded(speeds={0: ["fast"] * 20}), recorded())
+    assert (counts.episodes, counts.left_out, counts.reason) == (1, 2, str(lost))
+    assert json.loads((out / "meta/info.json").read_text())["total_frames"] == 30
+
+
 def test_nothing_is_left_of_a_dataset_without_episodes(tmp_path):
     with pytest.raises(StationError, match=r"no second has all of vesc\.speed, servo\.data"):
         written(tmp_path, recorded(images=[]))
@@ -161,7 +227,10 @@ def test_another_folder_is_not_replaced(tmp_path):
     other = tmp_path / "dataset"
     other.mkdir()
     (other / "thesis.txt").write_text("years")
-    with pytest.raises(StationError, match="is no dataset of LeRobot"):
+    # A dataset too, but another program's.
+    (other / "meta").mkdir()
+    (other / "meta/info.json").write_text("{}")
+    with pytest.raises(StationError, match="is no dataset of `iort export`"):
         write(other, [recorded()], SHAPE, task="drive", robot="car", units={}, force=True)
     assert (other / "thesis.txt").read_text() == "years"
 
@@ -198,6 +267,13 @@ def test_an_incident_becomes_an_episode_from_its_file_alone(tmp_path):
         source.samples("vesc", ["sped"])
     with pytest.raises(StationError, match=r"a\.mcap has no stream lidar"):
         source.samples("lidar", ["data"])
+
+
+def test_a_link_to_nothing_is_in_the_way(tmp_path):
+    (tmp_path / "dataset").symlink_to(tmp_path / "gone")
+    with pytest.raises(StationError, match="exists: give another --out"):
+        written(tmp_path, recorded())
+    assert (tmp_path / "dataset").is_symlink()
 
 
 def test_a_file_that_is_no_incident_is_an_error(tmp_path):
