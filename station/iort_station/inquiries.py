@@ -34,7 +34,7 @@ from iort_station.errors import UsageError
 from iort_station.fleet import registry
 from iort_station.lab import Lab
 from iort_station.operations import quarantine
-from iort_station.operations.verdict import Verdict, verdict
+from iort_station.operations.verdict import Verdict, overlap, verdict
 from iort_station.times import between_hours, duration_us, iso, stamped
 
 # What an answer reads at most: batches of a stream, values that stay, the time between start and end.
@@ -172,21 +172,23 @@ class Inquiries:
         }
         if not statistics:
             return _answer(asked, _audit(word), **facts, **_rows(result))
+        stretches, cut = self._groups(robot, result, start_us, end_us, per)
         groups = [
             {
                 **_between(first_us, last_us),
                 **about,
                 **_figures(result, first_us, last_us, statistics),
             }
-            for first_us, last_us, about in self._groups(robot, result, start_us, end_us, per)
+            for first_us, last_us, about in stretches
         ]
-        return _answer(asked, _audit(word), **facts, groups=groups)
+        return _answer(asked, _audit(word), cut=cut, **facts, groups=groups)
 
     def _groups(
         self, robot: str, result: Result, start_us: int, end_us: int, per: str
-    ) -> list[tuple[int, int, Facts]]:
-        """The stretches of time of the statistics."""
+    ) -> tuple[list[tuple[int, int, Facts]], list[str | Facts]]:
+        """The stretches of time of the statistics, and what they leave out."""
         found: list[tuple[int, int, Facts]]
+        cut: list[str | Facts] = []
         if per == "range":
             found = [(start_us, end_us, {})]
         elif per == "run":
@@ -195,13 +197,22 @@ class Inquiries:
                 (max(one.from_us, start_us), min(one.to_us, end_us), {"run": one.id, "state": one.state})
                 for one in runs
             ]
+            if overlap(self._cloud, robot, result.stream, start_us, end_us):
+                cut.append("runs overlap in time: a group has the samples of all of them")
         elif per == "lap":
             found = []
+            if len(self._lab.runs(robot, start_us, end_us, count=MOST_LISTED + 1)) > MOST_LISTED:
+                raise UsageError(
+                    f"the range has more than {MOST_LISTED} runs, of which laps are searched: choose a "
+                    "shorter one"
+                )
             for run in laps_of_runs(
                 self._cloud, robot, start_us, end_us, count=MOST_LISTED, progress=_bounded(self._most)
             ):
                 table = run.mined.tables.get(LAPS_TABLE)
                 if table is None or not len(table["lap"]):
+                    reasons = "; ".join(run.mined.missing.values()) or "none was found"
+                    cut.append(said(f"run {run.run} has no laps: {reasons}"))
                     continue
                 starts = table["start_us"].tolist()
                 # A lap ends where the next one begins.
@@ -211,13 +222,17 @@ class Inquiries:
                 ):
                     found.append((first_us, last_us, {"run": run.run, "lap": lap, "complete": complete}))
         else:
-            found = [(first_us, last_us, {}) for first_us, last_us in bins(result.times_us, duration_us(per))]
+            # The range may cut the first and the last one.
+            found = [
+                (max(first_us, start_us), min(last_us, end_us), {})
+                for first_us, last_us in bins(result.times_us, duration_us(per))
+            ]
         if len(found) > MOST_ROWS:
             raise UsageError(
                 f"per {per} gives {len(found):,} groups, at most {MOST_ROWS} are sent: choose a longer one, "
                 "or a shorter range"
             )
-        return found
+        return found, cut
 
     def runs(
         self,
@@ -347,7 +362,7 @@ class Inquiries:
         )
 
 
-def _answer(asked: Facts, audit: Facts, *, cut: Sequence[str] = (), **facts: Any) -> Facts:
+def _answer(asked: Facts, audit: Facts, *, cut: Sequence[str | Facts] = (), **facts: Any) -> Facts:
     return {"asked": asked, "audit": audit, "cut": list(cut), **facts}
 
 
@@ -419,7 +434,12 @@ def _figures(result: Result, first_us: int, last_us: int, statistics: Iterable[s
     figures = []
     for name, column in result.columns.items():
         for statistic in statistics:
-            value, count = figure(statistic, name, column[first:last])
+            try:
+                # The field's own name is a robot's word.
+                value, count = figure(statistic, "a field", column[first:last])
+            except UsageError as error:
+                error.nearest = (name,)
+                raise
             unit = None if statistic == "count" else result.unit(name) or None
             about = {"field": said(name), "statistic": statistic, "unit": unit}
             figures.append({**about, "value": _value(value), "values": count})

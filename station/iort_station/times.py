@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import datetime, timedelta, timezone
+from operator import index
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from iort_station.errors import UsageError
@@ -47,10 +48,8 @@ def time_us(value: Time, now_us: int) -> int:
 
     Raises `UsageError`.
     """
-    if isinstance(value, int):
-        return value
-    if isinstance(value, datetime):
-        return (value.astimezone(timezone.utc) - _EPOCH) // timedelta(microseconds=1)
+    if not isinstance(value, str):
+        return _since_epoch(value)
     text = value.strip()
     if text == "now":
         return now_us
@@ -74,6 +73,21 @@ def time_us(value: Time, now_us: int) -> int:
             "time must be now, -10m for ten minutes ago, 20:04, or ISO 8601 such as 2026-05-04T10:00:00Z, "
             f"got {value!r}"
         ) from error
+
+
+def _since_epoch(value: int | datetime) -> int:
+    try:
+        if isinstance(value, datetime):
+            return (value.astimezone(timezone.utc) - _EPOCH) // timedelta(microseconds=1)
+        # numpy's integers too, which are a query's times.
+        t_us = index(value)
+        _EPOCH + timedelta(microseconds=t_us)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UsageError(
+            "time must be microseconds since the epoch as an integer, a datetime or a text, in the years 1 "
+            f"to 9999, got {value!r}"
+        ) from error
+    return t_us
 
 
 def is_clock(text: str) -> bool:

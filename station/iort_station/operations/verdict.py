@@ -11,14 +11,15 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from iort_analysis.samples.batches import RefusedItems
 from iort_contract.dynamodb import starting_between
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S
-from iort_contract.messages.batch import batch_id
-from iort_contract.tables import BATCH
+from iort_contract.messages.batch import batch_id, run_ends
+from iort_contract.tables import BATCH, PREVIOUS
 from iort_station.cloud import Cloud
 from iort_station.data.accounts import SILENT_US, Account
 from iort_station.data.recorded import Recorded
@@ -92,9 +93,9 @@ def verdict(
     if refused is None:
         items: Iterator[Mapping[str, Any]] = headers(cloud, robot, stream, first_us, last_us, refused=bad)
     else:
-        # Strings and numbers only, so no deserializer is needed.
-        stored = recorded.headers(starting_between(first_us, last_us))
-        items = ({name: next(iter(value.values())) for name, value in item.items()} for item in stored)
+        items = _headers(recorded, first_us, last_us)
+
+    earlier: set[str] = set()
 
     def counted() -> Iterator[Mapping[str, Any]]:
         nonlocal batches
@@ -103,6 +104,7 @@ def verdict(
                 raise _TooManyError
             with suppress(ContractError):
                 batches += low <= batch_id(item.get(BATCH)).t_us < high
+                earlier.update(end.boot for end in run_ends(item.get(PREVIOUS, "")))
             yield item
 
     about: dict[str, Any] = {"robot": robot, "stream": stream, "start_us": start_us, "end_us": end_us}
@@ -121,11 +123,15 @@ def verdict(
     ]
     if not runs:
         reasons.append(_Reason(known=False, text=f"nothing of {robot} {stream} is stored"))
-    elif before is None and (oldest := min(runs, key=lambda run: run.first_us)).first_seq > 0:
-        text = (
-            f"the first stored batch is number {oldest.first_seq:,} of its run: before it is expired or lost"
-        )
-        reasons.append(_Reason(known=False, text=text))
+    elif before is None:
+        oldest = min(runs, key=lambda run: run.first_us)
+        text, stored = "", {run.boot for run in runs}
+        if oldest.first_seq > 0:
+            text = f"the first stored batch is number {oldest.first_seq:,} of its run"
+        elif low < oldest.first_us and earlier - stored - {lost.boot for lost in found.lost_runs}:
+            text = "the first stored run names runs before it"
+        if text:
+            reasons.append(_Reason(known=False, text=f"{text}: what was before is expired or lost"))
     unread, named = refused or (bad.count, bad.reason)
     if unread := max(unread, found.refused):
         text = f"{unread:,} stored items cannot be read" + (f"; the first: {named}" if named else "")
@@ -140,6 +146,19 @@ def verdict(
         batches=batches,
         missing=sum(one.missing for one in reasons),
     )
+
+
+def overlap(cloud: Cloud, robot: str, stream: str, start_us: int, end_us: int) -> bool:
+    """Whether runs recorded a stream at the same time in a range, as after a clock was set back."""
+    found = audit(stream, _headers(Recorded(cloud, robot, stream), start_us - MAX_BATCH_SPAN_US, end_us))
+    spans = sorted((run.first_us, run.last_us) for run in found.runs)
+    return any(one[1] >= after[0] for one, after in pairwise(spans))
+
+
+def _headers(recorded: Recorded, first_us: int | None, last_us: int | None) -> Iterator[Mapping[str, Any]]:
+    # Strings and numbers only, so no deserializer is needed.
+    for item in recorded.headers(starting_between(first_us, last_us)):
+        yield {name: next(iter(value.values())) for name, value in item.items()}
 
 
 def _untils(runs: Sequence[RunAudit]) -> Iterator[tuple[RunAudit, int]]:

@@ -161,20 +161,25 @@ def test_a_hundred_questions_agree_with_duckdb_over_the_archive(stored, seed):
         f"WHERE t >= ? AND t < ? AND ({condition}) GROUP BY bin ORDER BY bin",
         [begin, every_us, every_us, begin, first_us, last_us],
     ).fetchall()
-    of_duckdb = [(start, count, figures) for start, count, *figures in rows]
+    # The range cuts the first and the last stretch.
+    of_duckdb = [
+        (max(start, first_us), min(start + every_us, last_us), count, figures)
+        for start, count, *figures in rows
+    ]
     ours = [
         (
             group["from_us"],
+            group["to_us"],
             group["samples"],
             [one["value"] for one in group["figures"]] + [one["values"] for one in group["figures"]],
         )
         for group in answer["groups"]
     ]
     if per == "range" and not rows:
-        assert (ours[0][1], answer["samples"]) == (0, 0)
+        assert (ours[0][2], answer["samples"]) == (0, 0)
         return
     assert ours == of_duckdb
-    assert answer["samples"] == sum(count for _, count, _ in of_duckdb)
+    assert answer["samples"] == sum(count for _, _, count, _ in of_duckdb)
     assert answer["asked"]["from_us"] == first_us
     assert answer["audit"]["word"] in {"complete", "unknown"}
 
@@ -287,9 +292,10 @@ def test_answers_are_bounded_and_say_what_is_cut(stored):
     with pytest.raises(UsageError, match=r"a statistic must be one of count, first, .*got 'median'"):
         ask.query("car", "vesc", **when, statistics=["median"])
     with pytest.raises(
-        UsageError, match="mode holds more than numbers: it has only count, first, last, not mean"
-    ):
-        ask.query("car", "vesc", **when, statistics=["mean"], fields=["mode"])
+        UsageError, match="a field holds more than numbers: it has only count, first, last, not mean"
+    ) as error:
+        ask.query("car", "vesc", **when, statistics=["mean"])
+    assert error.value.nearest == ("armed",)
     with pytest.raises(UsageError, match="per lap needs statistics"):
         ask.query("car", "vesc", **when, per="lap")
     ask = Inquiries(ask._cloud, most_batches=50)
@@ -311,6 +317,26 @@ def test_runs_and_statistics_of_them(stored):
     assert group["run"] == "0badcafe"
     mean = database.execute("SELECT avg(speed) FROM stored").fetchone()[0]
     assert (group["figures"][0]["value"], group["figures"][0]["unit"]) == (mean, "erpm")
+
+
+def test_what_groups_leave_out_is_said():
+    # The second run's clock was set back into the first one.
+    one, other = (
+        [Batch(boot, seq, [start + seq * 1_000_000], {"speed": [seq]}) for seq in range(10)]
+        for boot, start in (("0badcafe", START), ("1badcafe", START + 5_500_000))
+    )
+    ask = Inquiries(cloud_of(*one, *other))
+    when = {"start": iso(START), "end": iso(START + 60_000_000), "statistics": ["count"]}
+    assert ask.query("car", "vesc", **when, per="run")["cut"] == [
+        "runs overlap in time: a group has the samples of all of them"
+    ]
+    laps = ask.query("car", "vesc", **when, per="lap")
+    assert laps["groups"] == []
+    assert all("has no laps: " in each["robot_text"] for each in laps["cut"])
+    assert len(laps["cut"]) == 2
+    many = [Batch(f"{n:08x}", 0, [START + n * 1_000_000], {"speed": [n]}) for n in range(51)]
+    with pytest.raises(UsageError, match="more than 50 runs, of which laps are searched"):
+        Inquiries(cloud_of(*many)).query("car", "vesc", **when, per="lap")
 
 
 def test_every_answer_has_what_was_asked_and_the_audits_word(stored):

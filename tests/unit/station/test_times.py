@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 
+import numpy as np
 import pytest
 
-from iort_station.errors import StationError
+from iort_station.errors import StationError, UsageError
 from iort_station.times import duration_us, has_zone, iso, iso_s, time_us
 
 NOW = 1_700_000_000_123_456
@@ -26,6 +27,7 @@ NOW = 1_700_000_000_123_456
         ("00:13+02:00", 1_699_999_980_000_000),
         ("9:00Z", 1_699_952_400_000_000),
         (17, 17),
+        (np.int64(17), 17),
         (datetime(1970, 1, 1, 0, 0, 1, tzinfo=timezone.utc), 1_000_000),
     ],
 )
@@ -52,6 +54,14 @@ def test_a_time_without_a_zone_is_in_this_machines_zone():
 def test_an_invalid_time_is_refused(text):
     with pytest.raises(StationError, match=r"must be .*, got"):
         time_us(text, NOW)
+
+
+@pytest.mark.parametrize(
+    "value", [1.5, float("nan"), b"now", [1], np.datetime64("2023-11-14"), 2**70, -(2**70)]
+)
+def test_what_is_no_time_is_refused(value):
+    with pytest.raises(UsageError, match=r"time must be microseconds since the epoch as an integer, .*, got"):
+        time_us(value, NOW)
 
 
 def test_durations_are_parsed():

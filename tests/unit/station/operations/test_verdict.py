@@ -115,8 +115,18 @@ def test_without_an_account_nobody_knows_what_followed():
 
 def test_numbers_before_the_first_stored_one_are_unknown():
     found = word(run(without={0, 1}), [report()])
-    assert found.why == ("the first stored batch is number 2 of its run: before it is expired or lost",)
+    assert found.why == ("the first stored batch is number 2 of its run: what was before is expired or lost",)
     assert word(run(without={0, 1}), [report()], START + 4 * S).word == "complete"
+
+
+def test_runs_before_the_first_stored_one_are_unknown():
+    batches = run("1badcafe", previous=(RunEnd("0badcafe", 11),))
+    for start, expected in ((None, "unknown"), (START - 60 * S, "unknown"), (START, "complete")):
+        found = word(batches, [report("1badcafe")], start)
+        assert found.word == expected
+    assert word(batches, [report("1badcafe")], START - 60 * S).why == (
+        "the first stored run names runs before it: what was before is expired or lost",
+    )
 
 
 def test_losses_that_an_agent_reports():
