@@ -68,13 +68,19 @@ def _places(root: Path) -> Iterator[tuple[Path, str]]:
                 yield path, pattern.replace("NUMBER", f"({_NUMBER})")
 
 
-def refuse(root: Path = ROOT, *, tag: bool = False) -> None:
-    """Raise ReleaseError if this commit must not become, or is not, the release of its version."""
+def refuse(root: Path = ROOT, *, tag: bool = False, built: str | None = None) -> str:
+    """Return the checkout's commit, which may become, or is, the release of its version.
+
+    Raises ReleaseError if it must not, and if it is not the one that was ``built``.
+    """
     number = version(root)
-    changed = _git(root, "status", "--porcelain")
+    # A user's configuration may hide what is not tracked.
+    changed = _git(root, "status", "--porcelain", "--untracked-files=normal", "--ignore-submodules=none")
     if changed:
         raise ReleaseError(f"the checkout must have no change that is not committed, got\n{changed}")
     head, tagged = _git(root, "rev-parse", "HEAD"), _git(root, "tag", "--list", f"v{number}")
+    if built not in {None, head}:
+        raise ReleaseError(f"the checkout must stay at {built}, which is built, got {head}: make it again")
     # Who has checked a tag out may build it again, and compare the bytes.
     if tagged and (tag or _git(root, "rev-parse", f"v{number}^{{commit}}") != head):
         raise ReleaseError(
@@ -87,6 +93,7 @@ def refuse(root: Path = ROOT, *, tag: bool = False) -> None:
         raise ReleaseError(
             f"CHANGELOG.md must have a section '## {number} - DATE', got '{headings[0]}' first"
         )
+    return head
 
 
 def build(out: Path) -> list[Path]:
@@ -160,27 +167,43 @@ def sums(files: Iterable[Path], out: Path) -> None:
 
 def release(*, architectures: Sequence[str], tag: bool) -> None:
     """Build into dist/, check it, install it and run the manual's commands with it; then tag, if asked."""
-    refuse(tag=tag)
+    commit = refuse(tag=tag)
     built = make(architectures)
     check(built)
     tests = [PROOF, *([PROOF_OF_WHEELHOUSES] if architectures else [])]
     _run(sys.executable, "-m", "pytest", *tests, show=True, IORT_DIST=str(DIST))
+    # Building and trying it take minutes, in which somebody may have gone on.
+    refuse(tag=tag, built=commit)
     if tag:
-        _git(ROOT, "tag", "--annotate", f"v{version()}", "--message", f"iort {version()}")
+        _git(ROOT, "tag", "--annotate", f"v{version()}", commit, "--message", f"iort {version()}")
         print(f"tagged v{version()}; `git push origin v{version()}` publishes the tag")
 
 
-def make(architectures: Iterable[str]) -> list[Path]:
-    """Fill dist/ with what the checkout has now: packages, wheelhouses and their hashes."""
+def make(architectures: Sequence[str], dist: Path = DIST) -> list[Path]:
+    """Fill dist/ with what the checkout has now: packages, wheelhouses and their hashes, all or nothing."""
     from scripts import wheelhouse  # noqa: PLC0415 - it imports this module
 
-    shutil.rmtree(DIST, ignore_errors=True)
-    built = build(DIST)
-    houses = [wheelhouse.make(architecture, built, DIST) for architecture in architectures]
-    sums([*built, *houses], DIST)
-    for path in [*built, *houses]:
-        print(path.relative_to(ROOT))
-    return built
+    for architecture in architectures:
+        wheelhouse.check_architecture(architecture)
+    with tempfile.TemporaryDirectory(prefix="release.", dir=_scratch()) as scratch:
+        part = Path(scratch) / dist.name
+        built = build(part)
+        houses = [wheelhouse.make(architecture, built, part) for architecture in architectures]
+        sums([*built, *houses], part)
+        if dist.exists():
+            shutil.rmtree(dist)
+        part.rename(dist)
+    made = [dist / path.name for path in [*built, *houses]]
+    for path in made:
+        print(os.path.relpath(path, ROOT))
+    return made[: len(built)]
+
+
+def _scratch() -> Path:
+    """A folder on the checkout's own disk, which Git ignores."""
+    folder = ROOT / "build"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 def _epoch() -> int:

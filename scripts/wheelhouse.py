@@ -33,10 +33,7 @@ _PATCH = 10
 
 def make(architecture: str, built: Iterable[Path], out: Path) -> Path:
     """Download the wheels for an architecture, and pack them with our own; the archive's path."""
-    if architecture not in ARCHITECTURES:
-        raise ReleaseError(
-            f"the architecture must be one of {', '.join(ARCHITECTURES)}, got {architecture!r}"
-        )
+    check_architecture(architecture)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / f"iort-wheelhouse-{version()}-{architecture}"
         folder.mkdir()
@@ -56,6 +53,14 @@ def make(architecture: str, built: Iterable[Path], out: Path) -> Path:
         script = (ROOT / "device" / "install.sh").read_text().replace("ARCHITECTURE", architecture)
         (folder / "install.sh").write_text(script)
         return pack(folder, out / f"{folder.name}.tar")
+
+
+def check_architecture(architecture: str) -> None:
+    """Raise ReleaseError for an architecture that has no packages."""
+    if architecture not in ARCHITECTURES:
+        raise ReleaseError(
+            f"the architecture must be one of {', '.join(ARCHITECTURES)}, got {architecture!r}"
+        )
 
 
 def needed(architecture: str, python: str) -> Iterator[tuple[str, list[str]]]:

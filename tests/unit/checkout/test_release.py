@@ -80,6 +80,21 @@ def test_a_change_that_is_not_committed_is_refused(checkout: Path) -> None:
         release.refuse(checkout)
 
 
+def test_a_new_file_that_git_is_told_to_hide_is_refused(checkout: Path) -> None:
+    git(checkout, "config", "status.showUntrackedFiles", "no")
+    (checkout / "new").touch()
+    with pytest.raises(ReleaseError, match=r"must have no change that is not committed, got\n\?\? new"):
+        release.refuse(checkout)
+
+
+def test_another_commit_than_the_built_one_is_not_tagged(checkout: Path) -> None:
+    built = release.refuse(checkout, tag=True)
+    assert release.refuse(checkout, tag=True, built=built) == built
+    git(checkout, "commit", "--quiet", "--allow-empty", "--message", "second")
+    with pytest.raises(ReleaseError, match=f"the checkout must stay at {built}, which is built, got"):
+        release.refuse(checkout, tag=True, built=built)
+
+
 @pytest.mark.parametrize("heading", ["1.2.3 - unreleased", "1.2.4 - 2026-01-02", "1.2.3"])
 def test_a_changelog_without_the_version_and_a_date_is_refused(checkout: Path, heading: str) -> None:
     (checkout / "CHANGELOG.md").write_text(f"# Changelog\n\n## {heading}\n")
@@ -126,3 +141,8 @@ def test_the_robots_tests_run_on_what_the_oldest_robot_gets() -> None:
 def test_an_architecture_without_packages_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ReleaseError, match="must be one of aarch64, x86_64, got 'armv7l'"):
         wheelhouse.make("armv7l", [], tmp_path)
+    (tmp_path / "dist").mkdir()
+    (tmp_path / "dist" / "SHA256SUMS").touch()
+    with pytest.raises(ReleaseError, match="must be one of aarch64, x86_64, got 'armv7l'"):
+        release.make(["aarch64", "armv7l"], tmp_path / "dist")
+    assert (tmp_path / "dist" / "SHA256SUMS").exists()
