@@ -165,7 +165,7 @@ class Inquiries:
         asked |= {"every": every, "statistics": statistics, "per": per, "recompute": shlex.join(command)}
         archived = result.origin.told()
         facts: Facts = {
-            "samples": len(result),
+            "samples": result.samples,
             "refused": result.refused,
             "null_as_no_sensor": [{"field": said(name), "values": n} for name, n in result.absent.items()],
             "from_archive": archived and between_hours(archived),
@@ -425,7 +425,7 @@ def _rows(result: Result) -> Facts:
         for name, column in result.columns.items()
     ]
     cut = [f"the first {shown} of {whole:,} rows: statistics are of all of them"] if shown < whole else []
-    return {"times_us": result.times_us[:shown].tolist(), "columns": columns, "cut": cut}
+    return {"rows": whole, "times_us": result.times_us[:shown].tolist(), "columns": columns, "cut": cut}
 
 
 def _figures(result: Result, first_us: int, last_us: int, statistics: Iterable[str]) -> Facts:

@@ -50,7 +50,8 @@ class Result:
     for null, bool for flags, objects for texts. ``refused`` counts what is stored and cannot be read;
     ``reason`` names the first: topic, time and error. ``absent`` counts values by field that became null
     because their sensor is not fitted. ``ros2`` tells that charge and energy have the ROS 2 driver's units.
-    ``origin`` tells what came from the archive.
+    ``origin`` tells what came from the archive. ``samples`` counts what was read: more than there are rows
+    if ``every`` has averaged it.
     """
 
     robot: str
@@ -62,6 +63,7 @@ class Result:
     ros2: bool = False
     absent: Mapping[str, int] = field(default_factory=dict)
     origin: Origin = field(default_factory=Origin)
+    samples: int = 0
     # The type of the stream's messages, if known.
     _kind_of: Callable[[], MessageType | None] = field(default=lambda: None, repr=False, compare=False)
 
@@ -160,12 +162,13 @@ def query(
         blocks = seconds(cloud, selection, recorded, scan=scan, progress=progress)
     else:
         blocks = samples(cloud, selection, recorded, absent=absent, scan=scan, progress=progress)
-    ros2 = False
+    ros2, taken = False, 0
 
     def watched() -> Iterator[Block]:
-        nonlocal ros2
+        nonlocal ros2, taken
         read = 0
         for block in blocks:
+            taken += len(block.times_us)
             read += len(block.times_us) * len(block.columns)
             if most is not None and read > most:
                 raise StationError(
@@ -189,6 +192,7 @@ def query(
         ros2,
         absent,
         recorded.origin.within(selection.start_us, selection.end_us),
+        taken,
         cache(partial(inventory.kind_of, cloud, selection)),
     )
 

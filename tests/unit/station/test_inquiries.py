@@ -285,6 +285,8 @@ def test_answers_are_bounded_and_say_what_is_cut(stored):
     rows = ask.query("car", "vesc", **when, fields=["speed"])
     assert (rows["samples"], len(rows["times_us"])) == (1000, 500)
     assert rows["cut"] == ["the first 500 of 1,000 rows: statistics are of all of them"]
+    averaged = ask.query("car", "vesc", **when, fields=["speed"], every="1s")
+    assert (averaged["samples"], averaged["rows"], len(averaged["times_us"])) == (1000, 100, 100)
     with pytest.raises(UsageError, match=r"at most 31 days, got 40\.0"):
         ask.query("car", "vesc", start="-40d")
     with pytest.raises(UsageError, match="per 100ms gives 900 groups, at most 500 are sent"):
