@@ -100,6 +100,8 @@ def test_another_protocol_is_refused(offered: tuple[str, ...], words: str) -> No
     [
         ("https://evil.example", 403),
         ("null", 403),
+        ("http://[evil", 403),
+        ("http://127.0.0.1.evil.example", 403),
         ("https://app.foxglove.dev.evil.example", 403),
         ("https://app.foxglove.dev", 101),
         ("http://localhost:8080", 101),
@@ -146,6 +148,15 @@ def test_the_password_can_be_guessed_a_few_times_and_who_has_it_may_connect_agai
         assert refused(f"{url}?key=correct%20horse")[0] in {401, 429}
 
 
+def test_a_password_that_was_removed_lets_nobody_in(tmp_path: Path) -> None:
+    password = Password(tmp_path, PasswordHasher(time_cost=1, memory_cost=8, parallelism=1))
+    password.set("correct horse")
+    with served(ByPassword(password)) as (_, url):
+        (tmp_path / "page-password").unlink()
+        status, words = refused(f"{url}?key=correct%20horse")
+    assert (status, "the password cannot be read" in words) == (503, True)
+
+
 @pytest.mark.parametrize(
     ("send", "code", "words"),
     [
@@ -184,6 +195,26 @@ def test_a_client_that_floods_is_cut_off_and_the_others_are_served() -> None:
         _is_served(channels, judge)
 
 
+def test_pings_are_answered_and_a_flood_of_them_is_cut_off() -> None:
+    async def ping(session: ClientSession) -> bytes:
+        async with session.ws_connect(url, protocols=[PROTOCOL], autoping=False) as client:
+            await client.ping(b"there?")
+            while (message := await client.receive()).type is not WSMsgType.PONG:
+                assert message.type in {WSMsgType.TEXT, WSMsgType.BINARY}
+            return bytes(message.data)
+
+    async def flood(client: ClientWebSocketResponse[bool]) -> None:
+        for _ in range(2000):
+            await client.ping()
+
+    with served() as (channels, url), Judge(url) as judge:
+        judge.do("subscribe", topic=TOPIC.name)
+        assert run(ping) == b"there?"
+        with suppress(ConnectionError):
+            assert cut_off(url, flood) == (1008, "a client may send 200 messages a second")
+        _is_served(channels, judge)
+
+
 def _is_served(channels: Channels, judge: Judge) -> None:
     until(channels.wanted)
     before = len(list(judge.got()))
@@ -212,6 +243,20 @@ def test_twenty_clients_are_served_and_one_too_many_is_told_so() -> None:
         status, got = run(work)
     assert status == 503
     assert got == [MESSAGE.data] * 20
+
+
+def test_many_that_come_at_once_are_no_more_than_may_come() -> None:
+    async def work(session: ClientSession) -> int:
+        came = await asyncio.gather(
+            *(session.ws_connect(url, protocols=[PROTOCOL]) for _ in range(20)), return_exceptions=True
+        )
+        clients = [one for one in came if not isinstance(one, BaseException)]
+        for client in clients:
+            await client.close()
+        return len(clients)
+
+    with served(most_clients=3) as (_, url):
+        assert run(work) == 3
 
 
 async def _send_until(channels: Channels, done: Callable[[], bool]) -> None:

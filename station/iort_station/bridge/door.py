@@ -45,8 +45,10 @@ MOST_CLIENTS = 16
 MOST_BYTES = 256 * 1024
 # More is not even read: aiohttp ends the connection.
 _MOST_READ_BYTES = 32 * MOST_BYTES
-# A client may send so many messages at once, and so many a second.
+# A client may send so many messages at once, and so many a second; pings count, too.
 _BURST, _PER_S = 1_000, 200
+# Each channel of a message gets an answer; more are not even looked at.
+_MOST_CHANNELS = 64
 # A client that does not answer for so long is gone.
 _HEARTBEAT_S = 20.0
 # The same words about the same client are said so seldom.
@@ -99,16 +101,23 @@ class ByPassword:
     def __call__(self, told: str, address: str) -> tuple[int, str] | None:
         """As `Admission`."""
         with self._lock:
-            digest = hmac.digest(self._secret, told.encode(errors="replace"), "sha256")
-            version, right = self._right
-            if version == self._password.version() and hmac.compare_digest(digest, right):
-                return None
-            if wait_s := self._tries.wait_s(address):
-                return 429, f"too many tries: try again in {wait_s + 0.5:.0f} s"
-            if not self._password.is_right(told):
-                return 401, "the address must end in /?key= and the password"
-            self._right = self._password.version(), digest
+            try:
+                return self._refusal(told, address)
+            except OSError as error:
+                return 503, f"the password cannot be read ({error}): start `iort bridge` again"
+
+    def _refusal(self, told: str, address: str) -> tuple[int, str] | None:
+        digest = hmac.digest(self._secret, told.encode(errors="replace"), "sha256")
+        version, right = self._right
+        now = self._password.version()
+        if version == now and hmac.compare_digest(digest, right):
             return None
+        if wait_s := self._tries.wait_s(address):
+            return 429, f"too many tries: try again in {wait_s + 0.5:.0f} s"
+        if not self._password.is_right(told):
+            return 401, "the address must end in /?key= and the password"
+        self._right = now, digest
+        return None
 
 
 def everybody(_told: str, _address: str) -> tuple[int, str] | None:
@@ -172,21 +181,36 @@ class Door(BackgroundServer):
             got = one_line(", ".join(filter(None, offered))[:100]) or "none"
             old = ": this client is too old" if _OLD_PROTOCOL in offered else ""
             return 400, f"the WebSocket's protocol must be {PROTOCOL}, got {got}{old}"
+        if (
+            refusal := await asyncio.to_thread(self._admits, request.query.get("key", ""), address)
+        ) is not None:
+            return refusal
+        # Nothing is awaited from here until the client is counted.
         if len(self._clients) >= self._most:
             return 503, f"{self._most} clients are connected already: end one of them"
-        return await asyncio.to_thread(self._admits, request.query.get("key", ""), address)
+        return None
 
     def _accepts(self, origin: str) -> bool:
         known = origin.rstrip("/").lower() if origin != "file://" else origin
-        return known in self._origins or on_loopback(urlsplit(origin).hostname or "")
+        if known in self._origins:
+            return True
+        try:
+            return on_loopback(urlsplit(origin).hostname or "")
+        except ValueError:
+            return False
 
     async def _pass(self, request: web.BaseRequest, client: int, address: str) -> web.StreamResponse:
         async with (
             ClientSession() as session,
             session.ws_connect(self._inner, protocols=[PROTOCOL], max_msg_size=0) as there,
         ):
+            # Pings are answered here, where they are counted.
             here = web.WebSocketResponse(
-                protocols=[PROTOCOL], max_msg_size=_MOST_READ_BYTES, heartbeat=_HEARTBEAT_S, compress=False
+                protocols=[PROTOCOL],
+                max_msg_size=_MOST_READ_BYTES,
+                heartbeat=_HEARTBEAT_S,
+                compress=False,
+                autoping=False,
             )
             await here.prepare(request)
             ways = [
@@ -203,6 +227,8 @@ class Door(BackgroundServer):
             finally:
                 for way in ways:
                     way.cancel()
+                # A client that is killed may end both: the other one's error is no news.
+                await asyncio.gather(*ways, return_exceptions=True)
                 await here.close()
             return here
 
@@ -218,7 +244,9 @@ class Door(BackgroundServer):
                 return WSCloseCode.MESSAGE_TOO_BIG, f"a message must have at most {MOST_BYTES} bytes"
             if left < 0:
                 return WSCloseCode.POLICY_VIOLATION, f"a client may send {_PER_S} messages a second"
-            if message.type is WSMsgType.TEXT:
+            if message.type is WSMsgType.PING:
+                await here.pong(message.data)
+            elif message.type is WSMsgType.TEXT:
                 told = _object(message.data)
                 if told is None:
                     return WSCloseCode.INVALID_TEXT, "a text message must be an object of JSON"
@@ -236,10 +264,10 @@ class Door(BackgroundServer):
     ) -> bool:
         """Whether a message is about publishing, which the wheel takes."""
         if told.get("op") == "advertise":
-            for channel in _list(told.get("channels")):
+            for channel in _list(told.get("channels"))[:_MOST_CHANNELS]:
                 await _answer(here, wheel.advertise(client, channel))
         elif told.get("op") == "unadvertise":
-            for channel in _list(told.get("channelIds")):
+            for channel in _list(told.get("channelIds"))[:_MOST_CHANNELS]:
                 wheel.unadvertise(client, channel)
         else:
             return False

@@ -31,6 +31,10 @@ _TYPES = {"geometry_msgs/Twist", "geometry_msgs/msg/Twist"}
 ENCODINGS = ("json", "ros1", "cdr")
 # Whoever holds a panel is heard so often at least: five times a second, and one may be late.
 SILENT_US = 300_000
+# A hold begins with a message this long after its first one: what has waited on its way comes all at once.
+SETTLES_US = 100_000
+# A client may offer so many channels; a tool has one for each of its panels.
+MOST_OFFERED = 16
 # So many messages between two ticks have waited on their way: whoever held the panel may have let go since.
 _AT_ONCE = 10
 _CDR_HEAD = 4
@@ -38,19 +42,22 @@ _TWIST = struct.Struct("<6d")
 
 
 class _Held(NamedTuple):
-    """What was published last: by which client, when, and where it puts the stick."""
+    """What was published last: by which client, since when without silence, and where it puts the stick."""
 
     client: int
+    since_us: int
     t_us: int
     stick: Stick
 
 
 class PublishedWheel:
     """A wheel that clients of the bridge hold, within a ``with`` block. ``say`` takes a line for all clients,
-    and its level."""
+    and its level; ``clock`` is the monotonic one, in microseconds."""
 
-    def __init__(self, seat: Seat, say: Callable[[str, Level], None]) -> None:
-        self._seat, self._say = seat, say
+    def __init__(
+        self, seat: Seat, say: Callable[[str, Level], None], clock: Callable[[], int] = monotonic_us
+    ) -> None:
+        self._seat, self._say, self._clock = seat, say, clock
         self._lock, self._end = threading.Lock(), threading.Event()
         # The encodings of what clients offer, by client and channel.
         self._offered: dict[tuple[int, int], str] = {}
@@ -78,7 +85,7 @@ class PublishedWheel:
         """A client wants to publish; returns why it cannot."""
         told = channel if isinstance(channel, dict) else {}
         number, topic, encoding = told.get("id"), told.get("topic"), told.get("encoding")
-        if type(number) is not int:
+        if type(number) is not int or not 0 <= number < 2**32:
             return f"a channel's id must be a whole number, got {shown(number)}"
         if topic != TOPIC:
             return f"only {TOPIC} can be published here, got {shown(topic)}"
@@ -86,13 +93,17 @@ class PublishedWheel:
             wanted = f"geometry_msgs/Twist as {', '.join(ENCODINGS)}"
             return f"{TOPIC} must be {wanted}, got {shown(told.get('schemaName'))} as {shown(encoding)}"
         with self._lock:
+            has = sum(of == client for of, _ in self._offered)
+            if has >= MOST_OFFERED and (client, number) not in self._offered:
+                return f"a client may offer {MOST_OFFERED} channels"
             self._offered[client, number] = str(encoding)
         return ""
 
     def unadvertise(self, client: int, channel: Any) -> None:
         """A client does not want to publish any longer."""
         with self._lock:
-            self._offered.pop((client, channel), None)
+            if type(channel) is int:
+                self._offered.pop((client, channel), None)
             if self._held is not None and self._held.client == client:
                 self._held = None
 
@@ -115,14 +126,15 @@ class PublishedWheel:
                 speed_mps, steering_rad = twist(data[4:], encoding)
             except ValueError as error:
                 return f"{TOPIC}: {error}"
-            now_us = monotonic_us()
-            held = self._held
-            if held is not None and held.client != client and now_us - held.t_us < SILENT_US:
+            now_us, held = self._clock(), self._held
+            if held is not None and now_us - held.t_us >= SILENT_US:
+                held = None
+            if held is not None and held.client != client:
                 return "another client of this bridge drives"
             self._since_tick += 1
             top_mps = min(self._seat.driver.top_mps, limits.max_speed_mps)
             stick = Stick(_within(speed_mps / top_mps), _within(steering_rad / limits.max_steering_rad))
-            self._held = _Held(client, now_us, stick)
+            self._held = _Held(client, now_us if held is None else held.since_us, now_us, stick)
         return ""
 
     # The wheel's own thread.
@@ -132,10 +144,10 @@ class PublishedWheel:
         while not self._end.wait(TICK_US / 1e6):
             with self._lock:
                 offered = bool(self._offered)
-                held, stick = self._stick(monotonic_us())
+                held, stick = self._stick(self._clock())
             try:
                 if offered:
-                    self._seat.tick(held=held, stick=stick, now_us=monotonic_us())
+                    self._seat.tick(held=held, stick=stick, now_us=self._clock())
                 elif taken:
                     # Nobody can drive any longer: others may.
                     self._seat.leave()
@@ -155,7 +167,7 @@ class PublishedWheel:
             self._held, self._deaf_until_us = None, now_us + SILENT_US
         self._since_tick = 0
         held = self._held
-        if held is None or now_us - held.t_us >= SILENT_US:
+        if held is None or now_us - held.t_us >= SILENT_US or held.t_us - held.since_us < SETTLES_US:
             return False, Stick()
         return True, held.stick
 

@@ -10,8 +10,7 @@ import pytest
 from typing_extensions import Self
 
 from iort_contract.messages.commands import DriveLimits
-from iort_station.bridge import driving
-from iort_station.bridge.driving import SILENT_US, TOPIC, PublishedWheel, twist
+from iort_station.bridge.driving import MOST_OFFERED, SETTLES_US, SILENT_US, TOPIC, PublishedWheel, twist
 from iort_station.fleet.driving import Driver, Phase, Stick
 from testkit.waiting import until
 
@@ -47,10 +46,32 @@ def seat() -> Seat:
     return Seat()
 
 
+class Clock:
+    """A clock that is set; in microseconds."""
+
+    def __init__(self) -> None:
+        self.us = 1_000_000
+
+    def __call__(self) -> int:
+        return self.us
+
+
 @pytest.fixture
-def wheel(seat: Seat) -> PublishedWheel:
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def wheel(seat: Seat, clock: Clock) -> PublishedWheel:
     """A wheel whose thread does not run."""
-    return PublishedWheel(seat, lambda _text, _level: None)  # type: ignore[arg-type]  # a fake
+    return PublishedWheel(seat, lambda _text, _level: None, clock)  # type: ignore[arg-type]  # a fake
+
+
+def held(wheel: PublishedWheel, clock: Clock, client: int, sent: bytes) -> str:
+    """Publish for as long as a hold needs to begin; returns why the last message was not taken."""
+    problem = wheel.publish(client, sent)
+    clock.us += SETTLES_US
+    return wheel.publish(client, sent) or problem
 
 
 def message(speed: float, steering: float, channel: int = 7) -> bytes:
@@ -64,6 +85,7 @@ def message(speed: float, steering: float, channel: int = 7) -> bytes:
         ({"topic": "/odom"}, "only /cmd_vel can be published here, got '/odom'"),
         ({"topic": None}, "only /cmd_vel can be published here, got None"),
         ({"id": "seven"}, "a channel's id must be a whole number, got 'seven'"),
+        ({"id": -1}, "a channel's id must be a whole number, got -1"),
         ({"id": True}, "a channel's id must be a whole number, got True"),
         ({"encoding": "protobuf"}, "/cmd_vel must be geometry_msgs/Twist as json, ros1, cdr"),
         ({"schemaName": "std_msgs/String"}, "got 'std_msgs/String' as 'json'"),
@@ -84,41 +106,71 @@ def test_a_channel_that_is_no_object_is_told(wheel: PublishedWheel) -> None:
     [(0.5, 0.1, Stick(0.5, 0.25)), (-3.0, -9.0, Stick(-1.0, -1.0)), (1e308, 0.0, Stick(1.0, 0.0))],
 )
 def test_a_twist_moves_the_stick_within_the_limits(
-    wheel: PublishedWheel, speed: float, steering: float, stick: Stick
+    wheel: PublishedWheel, clock: Clock, speed: float, steering: float, stick: Stick
 ) -> None:
     assert wheel.advertise(1, CHANNEL) == ""
-    assert wheel.publish(1, message(speed, steering)) == ""
-    assert wheel._stick(driving.monotonic_us()) == (True, stick)
+    assert held(wheel, clock, 1, message(speed, steering)) == ""
+    assert wheel._stick(clock()) == (True, stick)
 
 
-def test_silence_lets_go(wheel: PublishedWheel) -> None:
+def test_silence_lets_go(wheel: PublishedWheel, clock: Clock) -> None:
     wheel.advertise(1, CHANNEL)
-    wheel.publish(1, message(0.5, 0))
-    assert wheel._stick(driving.monotonic_us() + SILENT_US) == (False, Stick())
+    held(wheel, clock, 1, message(0.5, 0))
+    assert wheel._stick(clock() + SILENT_US - 1)[0]
+    assert wheel._stick(clock() + SILENT_US) == (False, Stick())
 
 
-def test_one_client_drives_at_a_time_and_the_next_once_it_is_silent_or_gone(wheel: PublishedWheel) -> None:
+def test_few_messages_that_waited_move_nothing(wheel: PublishedWheel, clock: Clock) -> None:
+    """A panel at 10 Hz was held while the way stood still for a second; since then it was let go."""
+    wheel.advertise(1, CHANNEL)
+    held(wheel, clock, 1, message(0.5, 0))
+    clock.us += 1_000_000
+    assert wheel._stick(clock()) == (False, Stick())
+    for _ in range(8):
+        wheel.publish(1, message(0.5, 0))
+    while clock.us < 3_000_000:
+        assert wheel._stick(clock()) == (False, Stick())
+        clock.us += 50_000
+
+
+def test_one_client_drives_at_a_time_and_the_next_once_it_is_silent_or_gone(
+    wheel: PublishedWheel, clock: Clock
+) -> None:
     for client in (1, 2):
         assert wheel.advertise(client, CHANNEL) == ""
-    assert wheel.publish(1, message(0.5, 0)) == ""
+    assert held(wheel, clock, 1, message(0.5, 0)) == ""
     assert wheel.publish(2, message(-0.5, 0)) == "another client of this bridge drives"
-    assert wheel._stick(driving.monotonic_us())[1] == Stick(0.5, 0.0)
+    assert wheel._stick(clock())[1] == Stick(0.5, 0.0)
     wheel.gone(1)
-    assert wheel._stick(driving.monotonic_us()) == (False, Stick())
+    assert wheel._stick(clock()) == (False, Stick())
     assert wheel.publish(2, message(-0.5, 0)) == ""
     assert "was not offered" in wheel.publish(1, message(0.5, 0))
 
 
-def test_messages_that_waited_move_nothing_until_they_fail_to_come(
+def test_a_client_that_offers_without_end_is_told_so_and_can_take_back_anything(
     wheel: PublishedWheel,
 ) -> None:
+    for number in range(MOST_OFFERED):
+        assert wheel.advertise(1, {**CHANNEL, "id": number}) == ""
+    assert "may offer 16 channels" in wheel.advertise(1, {**CHANNEL, "id": MOST_OFFERED})
+    assert wheel.advertise(2, CHANNEL) == ""
+    for channel in ([1], {}, None, 1.5):
+        wheel.unadvertise(1, channel)
+    wheel.unadvertise(1, 0)
+    assert wheel.advertise(1, {**CHANNEL, "id": MOST_OFFERED}) == ""
+
+
+def test_messages_that_waited_move_nothing_until_they_fail_to_come(
+    wheel: PublishedWheel, clock: Clock
+) -> None:
     wheel.advertise(1, CHANNEL)
+    held(wheel, clock, 1, message(1, 0))
     for _ in range(20):
         wheel.publish(1, message(1, 0))
-    now_us = driving.monotonic_us()
-    assert wheel._stick(now_us) == (False, Stick())
-    wheel.publish(1, message(1, 0))
-    assert wheel._stick(now_us + SILENT_US - 1) == (False, Stick())
+    assert wheel._stick(clock()) == (False, Stick())
+    clock.us += SILENT_US - SETTLES_US - 1
+    held(wheel, clock, 1, message(1, 0))
+    assert wheel._stick(clock()) == (False, Stick())
 
 
 @pytest.mark.parametrize(
@@ -150,12 +202,12 @@ def test_a_twist_is_read_in_every_encoding() -> None:
 
 
 def test_the_seat_is_used_only_while_somebody_may_publish_and_is_left_after_that(
-    seat: Seat, wheel: PublishedWheel
+    seat: Seat, wheel: PublishedWheel, clock: Clock
 ) -> None:
     with wheel:
         assert seat.ticks == []
         wheel.advertise(1, CHANNEL)
-        wheel.publish(1, message(0.5, 0))
+        held(wheel, clock, 1, message(0.5, 0))
         until(lambda: (True, Stick(0.5, 0.0)) in seat.ticks)
         wheel.gone(1)
         until(lambda: seat.left == 1)
