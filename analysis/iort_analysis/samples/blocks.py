@@ -121,9 +121,10 @@ def resample(blocks: Iterable[Block], every_us: int) -> Block:
         elif name in _CODES:
             columns[name] = np.fmax.reduceat(column, starts)
         else:
-            total = np.add.reduceat(np.nan_to_num(column), starts)
             number = np.add.reduceat(np.nan_to_num(counts.columns[name]), starts)
-            with np.errstate(invalid="ignore"):
+            # A sum that no number holds is infinite, and so is its mean.
+            with np.errstate(invalid="ignore", over="ignore"):
+                total = np.add.reduceat(np.where(np.isnan(column), 0.0, column), starts)
                 columns[name] = total / np.where(number == 0, np.nan, number)
     return Block(sums.times_us[starts], columns)
 
@@ -144,7 +145,8 @@ def _binned(block: Block, every_us: int) -> tuple[Block, Block]:
             sums[name] = np.fmax.reduceat(column, starts)
         else:
             known = ~np.isnan(column)
-            sums[name] = np.add.reduceat(np.where(known, column, 0.0), starts)
+            with np.errstate(over="ignore"):
+                sums[name] = np.add.reduceat(np.where(known, column, 0.0), starts)
             counts[name] = np.add.reduceat(known.astype(float), starts)
     return Block(bins[starts], sums), Block(bins[starts], counts)
 

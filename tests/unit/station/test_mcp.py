@@ -76,6 +76,17 @@ def test_the_documentation_is_there_to_read():
     assert page.contents[0].text == (ROOT / "docs" / "how-to" / "mcp.md").read_text()
 
 
+def test_a_mean_that_no_number_holds_is_null_or_an_error():
+    async def work(client):
+        asking = {"robot": "car", "stream": "vesc", **RANGE}
+        rows = await client.call_tool("query", {**asking, "every": "1s"})
+        return rows, await client.call_tool("query", {**asking, "statistics": ["mean"]})
+
+    rows, mean = asked(cloud_of(Batch("0badcafe", 0, [START, START + 1], {"speed": [1e308, 1e308]})), work)
+    assert rows.structured_content["columns"][0]["values"] == [None]
+    assert "beyond the numbers that 64 bits can hold" in mean.structured_content["error"]
+
+
 def test_an_error_says_what_to_do_and_marks_what_a_robot_wrote():
     async def work(client):
         return [
