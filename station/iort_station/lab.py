@@ -243,6 +243,7 @@ class Lab:
         """The newest ``count`` runs of a robot's agent that recorded in a range, newest first. A run that
         began before the range is given whole. It reads some batches of each run, never all samples."""
         start_us, end_us = _range(start, end)
+        _check_count(count)
         with one_root():
             found = recorded.runs(self._cloud, robot, start_us=start_us, end_us=end_us, count=count)["runs"]
         return [
@@ -345,6 +346,7 @@ class Lab:
         """The newest ``count`` findings of the analysis about drives that begin in a range, the newest first;
         of all robots without one."""
         start_us, end_us = _range(start, end)
+        _check_count(count)
         with one_root():
             found = stored.findings(self._cloud, robot, start_us, end_us, most=count)
             self._check_robot(robot, found)
@@ -355,6 +357,7 @@ class Lab:
     ) -> list[Laps]:
         """The laps of the newest ``count`` runs in a range, the oldest run first. It reads their samples."""
         start_us, end_us = _range(start, end)
+        _check_count(count)
         with one_root():
             found = list(recorded.laps_of_runs(self._cloud, robot, start_us, end_us, count=count))
         return [
@@ -407,6 +410,11 @@ def _range(start: Time | None, end: Time | None) -> tuple[int | None, int | None
     if start_us is not None and end_us is not None and start_us > end_us:
         raise UsageError("the range ends before it starts")
     return start_us, end_us
+
+
+def _check_count(count: int | None) -> None:
+    if count is not None and count < 1:
+        raise UsageError(f"count must be 1 or more, got {count}")
 
 
 def _robot(name: str, row: Mapping[str, Any]) -> Robot:

@@ -72,6 +72,10 @@ def lab() -> Lab:
 def test_a_query_is_numpy_arrow_pandas_and_polars(lab):
     found = lab.query("car", "vesc", START, START + 60_000, fields=["speed", "speed_mps"])
     assert found.columns["speed"].tolist() == [0, 1, 2]
+    # A query's own times, and pandas' ones, are times of another.
+    of_pandas = found.pandas().index
+    assert len(lab.query("car", "vesc", found.times_us[1], found.times_us[2])) == 1
+    assert len(lab.query("car", "vesc", of_pandas[1], of_pandas[2])) == 1
     table = found.arrow()
     assert table.column_names == ["time", "speed", "speed_mps"]
     assert {one.name: (one.metadata or {}).get(b"unit") for one in table.schema} == {
@@ -157,6 +161,9 @@ def test_every_error_is_the_librarys(lab):
         lab.runs("car", "yesterday")
     with pytest.raises(UsageError, match="ends before it starts"):
         lab.findings("car", START, START - 1)
+    for counting in (lab.runs, lab.findings, lab.laps):
+        with pytest.raises(UsageError, match="count must be 1 or more, got -1"):
+            counting("car", count=-1)
     with pytest.raises(UsageError, match="robot"):
         lab.query("no robot", "vesc")
     with pytest.raises(StationError, match="more than 10 values"):
