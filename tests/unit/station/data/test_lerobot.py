@@ -24,6 +24,7 @@ from iort_station.data.episodes import Field, Kept, Shape, Stored, episodes, usu
 from iort_station.data.images import Images
 from iort_station.data.lerobot import write
 from iort_station.errors import StationError
+from iort_station.output import whole_folder
 from testkit.dynamodb import TELEMETRY, item_of
 from tests.conftest import NO_LEROBOT
 from tests.unit.station.data.test_queries import START, cloud_of
@@ -267,6 +268,22 @@ def test_an_incident_becomes_an_episode_from_its_file_alone(tmp_path):
         source.samples("vesc", ["sped"])
     with pytest.raises(StationError, match=r"a\.mcap has no stream lidar"):
         source.samples("lidar", ["data"])
+
+
+def test_the_old_dataset_stays_if_the_new_one_is_interrupted_or_cannot_be_moved(tmp_path):
+    out, _ = written(tmp_path, recorded())
+    before = (out / "meta/info.json").stat().st_ino
+
+    def sources():
+        yield recorded()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write(out, sources(), SHAPE, task="drive", robot="car", units={}, force=True)
+    with pytest.raises(FileNotFoundError), whole_folder(out, "meta/iort.json", "dataset", force=True):
+        pass
+    assert list(tmp_path.iterdir()) == [out]
+    assert (out / "meta/info.json").stat().st_ino == before
 
 
 def test_a_link_to_nothing_is_in_the_way(tmp_path):
