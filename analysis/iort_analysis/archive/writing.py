@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from io import SEEK_END
 from itertools import groupby, islice
 from typing import IO, Any, NamedTuple
 
@@ -300,25 +301,27 @@ def write_hour(
 
 
 class Spool:
-    """Pieces in a file, until all of them are there: a file of the archive has one schema."""
+    """Pieces in a file, until all of them are there: a file of the archive has one schema. Several spools may
+    share the file."""
 
     def __init__(self, scratch: IO[bytes]) -> None:
         self._scratch = scratch
-        self._pieces: list[tuple[Mapping[str, str], int]] = []
+        self._pieces: list[tuple[Mapping[str, str], int, int]] = []
 
     def add(self, one: Piece) -> None:
         """Write a piece."""
-        self._pieces.append((one.kinds, one.batches))
+        at = self._scratch.seek(0, SEEK_END)
+        self._pieces.append((one.kinds, one.batches, at))
         with pa.ipc.new_stream(self._scratch, one.table.schema) as stream:
             stream.write_table(one.table)
 
     def pieces(self) -> Pieces:
         """The pieces, to be read once."""
-        return Pieces(self._read(), len(self._pieces), joined_kinds(kinds for kinds, _ in self._pieces))
+        return Pieces(self._read(), len(self._pieces), joined_kinds(kinds for kinds, *_ in self._pieces))
 
     def _read(self) -> Iterator[Piece]:
-        self._scratch.seek(0)
-        for kinds, batches in self._pieces:
+        for kinds, batches, at in self._pieces:
+            self._scratch.seek(at)
             # Each piece is one batch of Arrow's.
             table = pa.ipc.open_stream(self._scratch).read_all().combine_chunks()
             yield Piece(table.to_batches()[0], kinds, batches)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from contextlib import closing, suppress
+from contextlib import closing
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
@@ -175,9 +175,11 @@ def _sized(file: BinaryIO, size: int, *, within: bool = False) -> bytes:
     if len(head) < 4:
         raise _CutError
     (n,) = _U32.unpack(head)
-    if file.tell() + n > size and not within:
+    room = size - file.tell()
+    if n > room and not within:
         raise _CutError
-    return file.read(n)
+    # What a record claims may be more than the memory.
+    return file.read(min(n, room))
 
 
 def _inflated(compression: str, data: bytes) -> bytes:
@@ -185,13 +187,22 @@ def _inflated(compression: str, data: bytes) -> bytes:
     if compression in ("", "none"):
         return data
     parts, room = [], MAX_INFLATED
-    with suppress(EOFError):
-        for part in inflated(compression, iter([data])):
-            room -= len(part)
-            if room < 0:
-                raise TooLargeError(f"a chunk inflates to more than {MAX_INFLATED:,} bytes")
-            parts.append(part)
+    for part in _parts(compression, data):
+        room -= len(part)
+        if room < 0:
+            raise TooLargeError(f"a chunk inflates to more than {MAX_INFLATED:,} bytes")
+        parts.append(part)
     return b"".join(parts)
+
+
+def _parts(compression: str, data: bytes) -> Iterator[bytes]:
+    try:
+        yield from inflated(compression, iter([data]))
+    except EOFError:
+        return
+    except Exception as error:
+        # Each library raises its own.
+        raise ValueError(f"{compression} cannot be inflated: {error}") from error
 
 
 def _bag_chunk(data: bytes, known: dict[int, Found]) -> Iterator[_Message]:
@@ -245,7 +256,7 @@ def _mcap(scan: Scan, path: Path) -> Iterator[_Message]:
                 chunk.seek(28)
                 compression = _text(chunk)
                 (n,) = _U64.unpack(chunk.read(8))
-                records = chunk.read(n)
+                records = chunk.read(min(n, len(data)))
                 inside = _inflated(compression, records)
                 messages = BytesIO(inside)
                 found: list[_Message] = []
@@ -265,9 +276,10 @@ def _mcap_record(file: BinaryIO, size: int, *, within: bool = False) -> tuple[in
     if len(head) < _RECORD.size:
         raise _CutError
     kind, n = _RECORD.unpack(head)
-    if file.tell() + n > size and not (within and kind == _MCAP_CHUNK):
+    room = size - file.tell()
+    if n > room and not (within and kind == _MCAP_CHUNK):
         raise _CutError
-    return kind, file.read(n)
+    return kind, file.read(min(n, room))
 
 
 def _mcap_content(

@@ -50,6 +50,8 @@ _WAITING_SAMPLES = 4_000
 # A message of fewer bytes always fits: base64 takes a third more.
 _ALWAYS_FITS = MAX_MESSAGE_BYTES // 2
 _END_US = 2**62
+# MCAP has times that are larger: nobody believes either.
+_MOST_NS = 2**63 - 1
 # Before 2000 a clock is not set.
 FIRST_US = 946_684_800_000_000
 
@@ -93,7 +95,7 @@ class Run:
         self._topics, self._boot, self._store, self._times = topics, boot, store, times
         self._retention_s = retention_s
         self._waiting: dict[str, _Waiting] = {}
-        self._flatteners: dict[str, Flattener] = {}
+        self._flatteners: dict[tuple[str, str], Flattener] = {}
         self._size = 0
         self.counts: dict[str, Counts] = {}
         # Messages with a time that nobody believes, by stream.
@@ -110,7 +112,7 @@ class Run:
         if waiting is None:
             waiting = self._waiting[stream] = _Waiting()
         waiting.kinds.append(kind)
-        waiting.recorded_ns.append(recorded_ns)
+        waiting.recorded_ns.append(min(recorded_ns, _MOST_NS))
         waiting.raws.append(raw)
         size = len(raw)
         waiting.size += size
@@ -304,9 +306,10 @@ class Run:
             rows = np.flatnonzero(some.number_of == number)
             if not len(rows):
                 continue
-            flattener = self._flatteners.get(kind.id)
+            # A recording may say one hash of two definitions.
+            flattener = self._flatteners.get((kind.id, kind.definition))
             if flattener is None:
-                flattener = self._flatteners[kind.id] = Flattener(kind)
+                flattener = self._flatteners[kind.id, kind.definition] = Flattener(kind)
             flat = flattener.flat([some.raws[row] for row in rows.tolist()])
             shape_of[rows] = flat.shape_of + len(shapes)
             shapes += flat.shapes
@@ -320,8 +323,9 @@ def _settled(times_us: NDArray[np.int64]) -> int:
         return _END_US
     newest_us = int(times_us.max())
     settled_us = (newest_us - _SETTLED_US) // _SECOND_US * _SECOND_US
-    # All may be of some seconds.
-    return settled_us if int(times_us.min()) < settled_us else newest_us
+    # All may be of some seconds, or of one time.
+    first_us = int(times_us.min())
+    return settled_us if first_us < settled_us else max(newest_us, first_us + 1)
 
 
 class _Some(NamedTuple):
@@ -347,7 +351,9 @@ def _times(waiting: _Waiting) -> tuple[NDArray[np.int64], list[RosType], NDArray
     times_ns = np.array(waiting.recorded_ns, dtype=np.int64)
     ids = np.fromiter(map(id, waiting.kinds), dtype=np.int64, count=len(raws))
     _, firsts, number_of = np.unique(ids, return_index=True, return_inverse=True)
-    kinds = [waiting.kinds[first] for first in firsts.tolist()]
+    # In the order of the recording, because the batches of each import have the same numbers.
+    kinds = [waiting.kinds[first] for first in sorted(firsts.tolist())]
+    number_of = np.argsort(np.argsort(firsts))[number_of]
     for number, kind in enumerate(kinds):
         rows = np.flatnonzero(number_of == number)
         if not kind.stamped:

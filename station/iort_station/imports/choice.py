@@ -50,21 +50,23 @@ class Choice:
         out. Raises `UsageError` for a topic that the recording does not have."""
         chosen: dict[str, TopicChoice] = {}
         left_out: dict[str, str] = {}
+        taken: dict[str, str] = {}
         for topic, kind in sorted(there.items()):
-            one = self._one(topic, kind, {each.stream for each in chosen.values()})
+            one = self._one(topic, kind, taken)
             if self.only and not any(matches(pattern, topic) for pattern in self.only):
                 left_out[topic] = "not chosen by --topic"
             elif isinstance(one, str):
                 left_out[topic] = one
             else:
                 chosen[topic] = one
+                taken[one.stream] = topic
         lacking = [pattern for pattern in self.only if not any(matches(pattern, topic) for topic in there)]
         if lacking:
             listed = ", ".join(sorted(there)) or "none"
             raise UsageError(f"--topic {lacking[0]}: the recording has no such topic; it has {listed}")
         return chosen, left_out
 
-    def _one(self, topic: str, kind: str, taken: set[str]) -> TopicChoice | str:
+    def _one(self, topic: str, kind: str, taken: Mapping[str, str]) -> TopicChoice | str:
         if self.named is not None:
             for pattern, choice in self.named:
                 if topic == pattern or ("*" in pattern and matches(pattern, topic)):
@@ -75,8 +77,16 @@ class Choice:
             return TopicChoice(self.vesc_stream) if is_vesc else "not in the configuration"
         if is_ros_own(topic) and topic not in self.only:
             return "ROS' own"
-        stream = stream_for(topic, kind, taken)
-        return TopicChoice(f"topic-{stream}" if stream in OWN_STREAMS else stream, upload=self.upload)
+        stream = stream_for(topic, kind, taken.keys())
+        if stream in OWN_STREAMS:
+            stream = f"topic-{stream}"
+        try:
+            check_stream(stream)
+        except ContractError:
+            return "its name is none of ROS': --config can name a stream for it"
+        if stream in taken:
+            return f"its stream {stream} is that of {taken[stream]}: --config can name another"
+        return TopicChoice(stream, upload=self.upload)
 
 
 def configured(file: Path, robot: str, only: Sequence[str]) -> Choice:

@@ -9,16 +9,18 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from botocore.exceptions import ClientError
 
 from iort_contract.limits import ContractError
-from iort_contract.objects import code_of
+from iort_contract.objects import CHANGED, code_of
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
 _PREFIX = "imports/"
 _CHUNK = 4 * 1024 * 1024
+_ATTEMPTS = 3
 
 
 @dataclass(frozen=True)
@@ -57,15 +59,20 @@ class Ledger:
 
     def of(self, content: str) -> list[Import]:
         """The imports of a recording."""
+        return self._read(content)[0]
+
+    def _read(self, content: str) -> tuple[list[Import], dict[str, Any]]:
+        """The imports, and the condition for writing over what was read."""
         try:
             answer = self._client.get_object(Bucket=self._bucket, Key=_key(content))
         except ClientError as error:
             if code_of(error) in {"NoSuchKey", "404"}:
-                return []
+                return [], {"IfNoneMatch": "*"}
             raise
         try:
             notes = json.loads(answer["Body"].read())["imports"]
-            return [Import(**{**one, "streams": tuple(one["streams"])}) for one in notes]
+            imports = [Import(**{**one, "streams": tuple(one["streams"])}) for one in notes]
+            return imports, {"IfMatch": answer["ETag"]}
         except (ContractError, KeyError, TypeError, ValueError) as error:
             raise StationError(
                 f"{_key(content)} in the files' bucket is no note of an import: {error}"
@@ -73,11 +80,24 @@ class Ledger:
 
     def note(self, content: str, one: Import) -> None:
         """Note an import, in place of what was noted of its robot and run."""
-        others = [each for each in self.of(content) if (each.robot, each.run) != (one.robot, one.run)]
-        body = json.dumps({"imports": [asdict(each) for each in (*others, one)]}, indent=1)
-        self._client.put_object(
-            Bucket=self._bucket, Key=_key(content), Body=body.encode(), ContentType="application/json"
-        )
+        for last in (False,) * _ATTEMPTS + (True,):
+            there, condition = self._read(content)
+            others = [each for each in there if (each.robot, each.run) != (one.robot, one.run)]
+            body = json.dumps({"imports": [asdict(each) for each in (*others, one)]}, indent=1)
+            try:
+                self._client.put_object(
+                    Bucket=self._bucket,
+                    Key=_key(content),
+                    Body=body.encode(),
+                    ContentType="application/json",
+                    **condition,
+                )
+            except ClientError as error:
+                # Another import of the recording has noted itself.
+                if code_of(error) not in CHANGED or last:
+                    raise
+            else:
+                return
 
     def done(self, content: str, one: Import, samples: int, end: str) -> None:
         """Note that an import is done."""

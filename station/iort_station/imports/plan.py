@@ -7,12 +7,12 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from iort_contract.catalog.streams import OWN_STREAMS
@@ -20,7 +20,7 @@ from iort_contract.dynamodb import starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import batch_id
 from iort_contract.recordings import RecordingError
-from iort_contract.recordings.files import INDEX, Reader
+from iort_contract.recordings.files import INDEX, Reader, wrapped
 from iort_contract.recordings.rosbag import Recording, Unread
 from iort_contract.recordings.scan import Scan
 from iort_contract.recordings.tool_csv import VescLog
@@ -108,29 +108,36 @@ def recordings(given: Sequence[str]) -> Iterator[Path]:
     found: dict[Path, None] = {}
     for one in given:
         path = Path(one).expanduser()
-        # A pattern that no shell has expanded may begin anywhere.
-        named = [] if path.exists() else sorted(path.parent.parent.glob(f"{path.parent.name}/{path.name}"))
-        paths = [path] if path.exists() else named
+        # A pattern that no shell has expanded.
+        paths = (
+            [path] if path.exists() else sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+        )
         if not paths:
             raise UsageError(f"{one}: no such file or folder")
-        some = [each for path in paths for each in _within(path)]
+        try:
+            seen: set[Path] = set()
+            some = [each for path in paths for each in _within(path, seen)]
+        except OSError as error:
+            raise UsageError(f"{error.filename}: cannot be read: {error.strerror}") from error
         if not some:
             raise UsageError(f"{one}: has no recording: {', '.join(_SUFFIXES)}, or a folder of ROS 2")
         found.update(dict.fromkeys(each.resolve() for each in some))
     yield from found
 
 
-def _within(path: Path) -> Iterator[Path]:
+def _within(path: Path, seen: set[Path]) -> Iterator[Path]:
+    """The recordings of a path. Folders that were ``seen`` are not entered again: links may go round."""
     if path.is_file():
         # The file of a folder of ROS 2 stands for the folder.
         is_part = path.suffix in {".mcap", ".db3"} and (path.parent / _METADATA).is_file()
         yield path.parent if is_part else path
     elif (path / _METADATA).is_file():
         yield path
-    else:
+    elif path.is_dir() and (folder := path.resolve()) not in seen:
+        seen.add(folder)
         for each in sorted(path.iterdir()):
             if each.is_dir() or each.suffix.lower() in _SUFFIXES:
-                yield from _within(each)
+                yield from _within(each, seen)
 
 
 def look(
@@ -228,6 +235,9 @@ def _check_clock(plan: Plan) -> None:
             f"{plan.path}: its clock was ahead: it begins at {iso(plan.first_us)}; --start TIME gives the "
             "time of its first message"
         )
+    if plan.last_us > now_us + _AHEAD_US:
+        plan.notes.append(f"what it has until {iso(plan.last_us)}, when its clock was ahead, is left out")
+        plan.last_us = last_us()
     if plan.first_us < FIRST_US:
         plan.notes.append(f"what it has before its clock was set, from {iso(plan.first_us)}, is left out")
 
@@ -246,7 +256,9 @@ def check(
     for plan in plans:
         if plan.refused:
             continue
-        plan.store = ARCHIVE if archive or plan.last_us < old_us else TABLE
+        # Of a drive on the border, the table would delete the beginning before it is archived.
+        begin_us = plan.first_us if plan.first_us >= FIRST_US else plan.last_us
+        plan.store = ARCHIVE if archive or begin_us < old_us else TABLE
         imports = ledger.of(plan.content)
         own = next((one for one in imports if (one.robot, one.run) == (robot, plan.run)), None)
         if own is not None and own.done_ms:
@@ -321,13 +333,11 @@ def said_robot(path: Path) -> str:
     """The robot that a file says it is of, as an incident does; empty if it says none."""
     if path.suffix != ".mcap":
         return ""
-    try:
-        with path.open("rb") as file:
-            for one in make_reader(file).iter_metadata():
-                if robot := _robot_of(one.metadata):
-                    return robot
-    except (McapError, OSError, ValueError):
-        pass  # a file without an index says nothing
+    # A file without an index, or with a damaged one, says nothing.
+    with suppress(RecordingError), wrapped(str(path)), path.open("rb") as file:
+        for one in make_reader(file).iter_metadata():
+            if robot := _robot_of(one.metadata):
+                return robot
     return ""
 
 

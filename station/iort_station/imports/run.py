@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 
 from iort_contract.archive import Hour, hour_of
@@ -55,7 +56,7 @@ def run(
 ) -> list[Outcome]:
     """Import the plans that go on, in the order of their times; ``progress`` takes further messages."""
     ledger, going = Ledger(cloud), [plan for plan in plans if plan.goes_on]
-    archive, topics = ArchiveStore(cloud, robot), _Topics(cloud, robot)
+    topics = _Topics(cloud, robot)
     outcomes: list[Outcome] = []
     unwritten: list[Outcome] = []
 
@@ -65,24 +66,25 @@ def run(
             ledger.done(plan.content, plan.entry(robot), outcome.samples, outcome.end)
         unwritten.clear()
 
-    for number, plan in enumerate(going):
-        ledger.note(plan.content, plan.entry(robot))
-        store: Store = archive
-        if plan.store != ARCHIVE:
-            store = TableStore(cloud, units_per_s, again=plan.begun)
-        times = Times(FIRST_US, last_us(), plan.shift_us)
-        one = Run(topics, plan.run, store, times, retention_s)
-        attachments = Attachments(cloud, robot, every_s)
-        outcome = _Importing(Outcome(plan, one.counts), one, store, attachments, progress).all()
-        outcomes.append(outcome)
-        unwritten.append(outcome)
-        registry.note_streams(cloud, robot, [*plan.streams, TYPES_STREAM])
-        # An hour that the next one is in, too, is written once.
-        following = going[number + 1 :]
-        before = hour_of(following[0].first_us) if following else None
-        archive.flush(before)
-        if before is None or not archive.is_open():
-            settle()
+    with closing(ArchiveStore(cloud, robot)) as archive:
+        for number, plan in enumerate(going):
+            ledger.note(plan.content, plan.entry(robot))
+            store: Store = archive
+            if plan.store != ARCHIVE:
+                store = TableStore(cloud, units_per_s, again=plan.begun)
+            times = Times(FIRST_US, last_us(), plan.shift_us)
+            one = Run(topics, plan.run, store, times, retention_s)
+            attachments = Attachments(cloud, robot, every_s)
+            outcome = _Importing(Outcome(plan, one.counts), one, store, attachments, progress).all()
+            outcomes.append(outcome)
+            unwritten.append(outcome)
+            registry.note_streams(cloud, robot, [*plan.streams, TYPES_STREAM])
+            # An hour that the next one is in, too, is written once.
+            following = going[number + 1 :]
+            before = hour_of(following[0].first_us) if following else None
+            archive.flush(before)
+            if before is None or not archive.is_open():
+                settle()
     return outcomes
 
 
@@ -100,18 +102,25 @@ class _Importing:
         """Import everything that can be read."""
         plan, outcome = self.outcome.plan, self.outcome
         losses: dict[str, int] = {}
+        unread = Unread()
+        outcome.unread = unread.lines
         try:
-            losses = self._log() if plan.is_log else self._bag()
+            if plan.is_log:
+                self._log(losses)
+            else:
+                self._bag(unread, losses)
         except RecordingError as error:
             # What was read until there is good.
             outcome.end = str(error)
-            losses[f"{plan.path.name}.unread"] = 1
         outcome.end = outcome.end or (plan.scan.end if plan.scan is not None else "")
+        losses.update({f"{topic}.unread": count for topic, count in unread.counts.items()})
+        if outcome.end:
+            losses[f"{plan.path.name}.unread"] = 1
         self.run.end(f"import {plan.path.name}", losses)
         outcome.without_time, outcome.files = sum(self.run.without_time.values()), self.attachments.kept
         return outcome
 
-    def _log(self) -> dict[str, int]:
+    def _log(self, losses: dict[str, int]) -> None:
         log = self.outcome.plan.log()
         with log as rows:
             for count, row in enumerate(rows, 1):
@@ -119,12 +128,11 @@ class _Importing:
                 if count % _EVERY == 0:
                     self.progress(_EVERY)
         report = log.report()
-        lost: dict[str, int] = {f"skipped.{cause}": count for cause, count in report["skipped"].items()}
-        return {**lost, **{f"bad_cells.{column}": count for column, count in report["bad_cells"].items()}}
+        losses.update({f"skipped.{cause}": count for cause, count in report["skipped"].items()})
+        losses.update({f"bad_cells.{column}": count for column, count in report["bad_cells"].items()})
 
-    def _bag(self) -> dict[str, int]:
-        plan, unread = self.outcome.plan, Unread()
-        self.outcome.unread = unread.lines
+    def _bag(self, unread: Unread, losses: dict[str, int]) -> None:
+        plan = self.outcome.plan
         recording = plan.open(unread)
         streams = recording.open()
         ways: dict[int, tuple[Kind, _Way]] = {}
@@ -147,10 +155,8 @@ class _Importing:
                     hour = now
         finally:
             recording.close()
-        losses = {f"{topic}.unread": count for topic, count in unread.counts.items()}
-        for _, way in ways.values():
-            losses.update(way.losses())
-        return losses
+            for _, way in ways.values():
+                losses.update(way.losses())
 
 
 class _Way:

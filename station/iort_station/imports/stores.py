@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from io import SEEK_END
 from itertools import chain, groupby, pairwise
 from tempfile import TemporaryFile
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -54,6 +55,8 @@ TABLE, ARCHIVE = "table", "archive"
 # The archive's function joins the day's hours and compresses them again.
 _LEVEL = 2
 _ATTEMPTS = 3
+# Hours that begin later wait in another temporary file.
+_SCRATCH_BYTES = 256 * 1024 * 1024
 
 
 class Store(Protocol):
@@ -114,7 +117,7 @@ class TableStore:
 class _Open:
     """An hour of a stream that may still get batches: its pieces, and the ids and hashes of their batches."""
 
-    files: ExitStack
+    scratch: IO[bytes]
     spool: Spool
     hashes: dict[str, str] = field(default_factory=dict)
     spans: list[tuple[str, str]] = field(default_factory=list)
@@ -135,6 +138,7 @@ class ArchiveStore:
         self._manifest = ArchiveTable(cloud.client("dynamodb"), cloud.output("storage", "ArchiveTable"))
         self._objects = Objects(cloud.client("s3"), cloud.output("storage", "FilesBucket"))
         self._open: dict[tuple[str, Hour], _Open] = {}
+        self._scratches: list[IO[bytes]] = []
         self.hours = 0
         self.size_bytes = 0
 
@@ -151,8 +155,11 @@ class ArchiveStore:
     def piece(self, stream: str, hour: Hour, one: Piece, hashes: Sequence[tuple[str, str]]) -> None:
         key = stream, hour
         if key not in self._open:
-            files = ExitStack()
-            self._open[key] = _Open(files, Spool(files.enter_context(TemporaryFile())))  # noqa: SIM115 - it is
+            # A file each would be too many open ones, and one for all would only grow.
+            if not self._scratches or self._scratches[-1].seek(0, SEEK_END) > _SCRATCH_BYTES:
+                self._scratches.append(TemporaryFile())  # noqa: SIM115 - closed with the last hour in it
+            scratch = self._scratches[-1]
+            self._open[key] = _Open(scratch, Spool(scratch))
         to = self._open[key]
         to.spool.add(one)
         to.hashes.update(hashes)
@@ -161,9 +168,20 @@ class ArchiveStore:
     def flush(self, before: Hour | None) -> None:
         for stream, hour in sorted(self._open, key=lambda key: (key[1], key[0])):
             if before is None or hour < before:
-                with self._open[stream, hour].files:
-                    self._write(stream, hour, self._open[stream, hour])
+                self._write(stream, hour, self._open[stream, hour])
                 del self._open[stream, hour]
+        self._close({id(one.scratch) for one in self._open.values()})
+
+    def close(self) -> None:
+        """Forget what is not written."""
+        self._open.clear()
+        self._close(set())
+
+    def _close(self, but: Collection[int]) -> None:
+        for one in self._scratches:
+            if id(one) not in but:
+                one.close()
+        self._scratches = [one for one in self._scratches if not one.closed]
 
     def is_open(self) -> bool:
         """Whether hours wait to be written."""
@@ -192,8 +210,8 @@ class ArchiveStore:
         version = self._objects.version(key)
         row = self._row(topic, hour)
         with ExitStack() as files:
-            there = _There(self._objects, row, hour, files)
-            if new.hashes.keys() <= there.hashes.keys():
+            there = _There(self._objects, row, hour, new.hashes, files)
+            if not there.is_newer and new.hashes.keys() <= there.hashes.keys():
                 return
             hashes = {**new.hashes, **there.hashes}
             some = there.beside(new)
@@ -236,11 +254,28 @@ class ArchiveStore:
             ) from error
 
 
+def _damaged(row: ArchivedHour) -> StationError:
+    return StationError(
+        f"{row.key} is not the object that was archived: if the archive's function writes it now, import "
+        "again in an hour; otherwise run `iort archive verify`"
+    )
+
+
 class _There:
     """What the archive has of an hour already: the hashes by the ids of its batches, and its file."""
 
-    def __init__(self, objects: Objects, row: ArchivedHour | None, hour: Hour, files: ExitStack) -> None:
+    def __init__(
+        self,
+        objects: Objects,
+        row: ArchivedHour | None,
+        hour: Hour,
+        new: Collection[str],
+        files: ExitStack,
+    ) -> None:
+        """``new`` are the ids of the import's batches."""
         self._hour = hour
+        # Whether it was written after its row.
+        self.is_newer = False
         self.hashes: dict[str, str] = {}
         self._file: ArchiveFile | None = None
         if row is not None and row.refused:
@@ -251,11 +286,29 @@ class _There:
             return
         read = objects.read(row.key)
         file = files.enter_context(read.file)
-        if read.sha256 != row.sha256:
-            raise StationError(f"{row.key} is not the object that was archived: run `iort archive verify`")
-        self._file = ArchiveFile(file)
-        self._batches = dict(self._file.hashes(hour))
+        self.is_newer = read.sha256 != row.sha256
+        try:
+            self._file = ArchiveFile(file)
+            self._batches = dict(self._file.hashes(hour))
+        except (ContractError, ValueError, OSError, KeyError) as error:
+            raise _damaged(row) from error
         self.hashes.update(self._batches)
+        if self.is_newer and not self._follows(row, new):
+            raise _damaged(row)
+
+    def _follows(self, row: ArchivedHour, new: Collection[str]) -> bool:
+        """Whether the object has what the row says, and perhaps batches of the import, which was ended before
+        it wrote the row: all of them, or those from some number on, if it wrote the hour several times."""
+        every = sorted(self.hashes.items())
+        boots = {batch_id(one).boot for one in new}
+        own = [one for one in map(batch_id, self._batches) if one.boot in boots]
+        candidates: list[Collection[str]] = [(), new]
+        candidates += [
+            {str(one) for one in own if one.seq >= first} for first in sorted({one.seq for one in own})
+        ]
+        return any(
+            content_hash(one for one in every if one[0] not in added) == row.content for added in candidates
+        )
 
     def beside(self, new: _Open) -> Pieces:
         """The hour's pieces with new ones, in the order of their batches. Those that are there already stay

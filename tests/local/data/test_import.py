@@ -24,7 +24,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from iort_contract.archive import HOUR, JOIN, TASK
+from iort_contract.archive import HOUR, JOIN, TASK, ArchiveTable, parse_hour
+from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.dynamodb import starting_between
 from iort_contract.recordings.rosbag import Recording, Unread
 from iort_contract.recordings.scan import Scan
@@ -36,6 +37,7 @@ from iort_station.cloud import invoke as invoke_function
 from iort_station.data.recorded import Recorded, archive_of, telemetry_table, topic_of
 from iort_station.fleet import robots
 from iort_station.imports.choice import Choice
+from iort_station.imports.ledger import Ledger
 from iort_station.imports.plan import check, look
 from iort_station.imports.run import run
 from iort_station.operations import archive, audit
@@ -320,6 +322,7 @@ def test_what_was_cut_off_is_imported_up_to_where_it_is_good(
     for stream, some in of_file.items():
         assert len(data.query(cloud, robot, stream).times_us) == len(some) > 0
         assert audited(cloud, robot, [stream])[stream].complete
+    assert lost(cloud, robot) == {f"{cut.name}.unread": 1}
     assert "nothing to do" in iort("import", cut, robot).output
     # The whole one has what is there already.
     assert "of this time already" in iort("import", path, robot, status=1).output
@@ -462,3 +465,93 @@ def test_large_arrays_become_files(
     assert [key is not None for key in keys] == [True, False, True, False]
     client, bucket = cloud.client("s3"), cloud.output("storage", "FilesBucket")
     assert client.get_object(Bucket=bucket, Key=keys[2])["Body"].read() == images[2]
+
+
+def lost(cloud: Cloud, robot: str) -> dict[str, int]:
+    """What the runs' accounts say that was not imported."""
+    found = data.query(cloud, robot, ACCOUNT_STREAM).columns.get("counts", np.array([]))
+    return {path: count for text in found if text for path, count in json.loads(text).items()}
+
+
+def test_an_import_that_was_killed_before_the_row_goes_on(
+    embedded: EmbeddedCloud, importer: tuple[str, Iort], tmp_path: Path
+) -> None:
+    """The hour was there already: its object has the import's batches, and its row does not say so."""
+    (robot, iort), cloud = importer, embedded.cloud
+    paths, start_ns = [], fresh_ns()
+    for part in range(2):
+        (folder := tmp_path / str(part)).mkdir()
+        paths.append(made(folder, "bag", start_ns=start_ns + part * 10_000_000_000))
+    iort("import", paths[0], robot)
+    manifest = ArchiveTable(cloud.client("dynamodb"), cloud.output("storage", "ArchiveTable"))
+    topics = [topic_of(cloud, robot, stream) for stream in COUNTS]
+    before = [row for topic in topics for row in archive_of(cloud, topic).rows()]
+    iort("import", paths[1], robot)
+    after = [row for topic in topics for row in archive_of(cloud, topic).rows()]
+    for old, new in zip(before, after, strict=True):
+        assert old.content != new.content
+        manifest.keep(old, new)
+    ledger = Ledger(cloud)
+    (plan,) = look(paths[1:], Choice(), start_us=None)
+    (note,) = ledger.of(plan.content)
+    ledger.note(plan.content, replace(note, done_ms=0))
+    assert iort_of(embedded, "archive", "verify", robot).exit_code == 1
+
+    iort("import", paths[1], robot)
+    assert iort_of(embedded, "archive", "verify", robot).exit_code == 0
+    for stream, one in audited(cloud, robot).items():
+        assert one.complete
+        assert [each.samples for each in one.runs] == [COUNTS[stream]] * 2
+
+    # An object that says something else is not taken for this.
+    for old, new in zip(before, after, strict=True):
+        manifest.keep(replace(old, content="0" * 64), manifest.row(new.topic, parse_hour(new.hour)))
+    ledger.note(plan.content, replace(note, done_ms=0))
+    assert "iort archive verify" in str(iort("import", paths[1], robot, status=1).exception)
+
+
+def test_a_drive_on_the_border_of_the_retention_goes_into_the_archive(
+    importer: tuple[str, Iort], tmp_path: Path
+) -> None:
+    """The table would delete its beginning before that is archived."""
+    robot, iort = importer
+    border_ns, path = time.time_ns() - DEFAULT_RETENTION_DAYS * DAY_NS, tmp_path / "drive.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("std_msgs/msg/Int32", "ros2msg", b"int32 data")
+        channel = writer.register_channel("/x", "cdr", schema)
+        for day in (-1, 10):
+            writer.add_message(channel, border_ns + day * DAY_NS, b"\0\1\0\0\7\0\0\0", 0)
+        writer.finish()
+    (one,) = json.loads(iort("import", path, robot, "--dry-run", "--json").stdout)["recordings"]
+    assert one["store"] == "archive"
+
+
+def test_more_topics_than_files_may_be_open(
+    embedded: EmbeddedCloud, importer: tuple[str, Iort], tmp_path: Path
+) -> None:
+    """Also with names that nobody expects."""
+    (robot, _), cloud = importer, embedded.cloud
+    path, start_ns, topics = tmp_path / "drïve \udcff\n.mcap", fresh_ns(), 120
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("std_msgs/msg/Int32", "ros2msg", b"int32 data")
+        for i in range(topics):
+            channel = writer.register_channel(f"/t{i}", "cdr", schema)
+            writer.add_message(channel, start_ns + i, b"\0\1\0\0" + i.to_bytes(4, "little"), 0)
+        for topic in ("/a b", "", "/ä", "t0"):
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, start_ns, b"\0\1\0\0\0\0\0\0", 0)
+        writer.finish()
+    where = ["--local", "--embedded", str(tmp_path / "importer" / EMBEDDED.name)]
+    command = [str(Path(sys.executable).parent / "iort"), *where, "import", str(path), robot]
+
+    def few() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (100, 100))
+
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=few, check=False)
+    assert done.returncode == 0, done.stderr
+    assert data.query(cloud, robot, "t119").columns["data"].tolist() == [119]
+    assert data.query(cloud, robot, "t0").columns["data"].tolist() == [0]

@@ -96,7 +96,10 @@ def import_(
     days = int(cloud.find_output("storage", "RetentionDays") or DEFAULT_RETENTION_DAYS)
     try:
         size = sum(
-            one.stat().st_size for path in found for one in ([path] if path.is_file() else path.iterdir())
+            one.stat().st_size
+            for path in found
+            for one in ([path] if path.is_file() else path.iterdir())
+            if one.is_file()
         )
         with bar("reading", size, DownloadColumn(), TransferSpeedColumn()) as progress:
             plans = planning.look(found, choice, start_us=start_us, progress=progress)
@@ -234,9 +237,15 @@ def _cost(plans: list[Plan], days: int) -> dict[str, float]:
     for plan in plans:
         if not plan.goes_on:
             continue
-        span_us, streams = plan.last_us - plan.first_us, len(plan.streams)
-        hours = streams * (plan.last_us // _HOUR_US - plan.first_us // _HOUR_US + 1)
-        one = imports.Imported(streams * span_us / 1e6 + streams, hours, plan.size)
+        # Of few messages, or if a clock was not set, no more seconds and hours than messages.
+        seconds = (plan.last_us - plan.first_us) / 1e6 + 1
+        hours = plan.last_us // _HOUR_US - plan.first_us // _HOUR_US + 1
+        counts = plan.streams.values()
+        one = imports.Imported(
+            sum(min(seconds, count) for count in counts),
+            sum(min(hours, count) for count in counts),
+            plan.size,
+        )
         units = imports.archive_units(one) if plan.store == "archive" else imports.table_units(one, days)
         more, kept = imports.dollars(units)
         once, stored = once + more, stored + kept

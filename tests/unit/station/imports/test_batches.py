@@ -17,10 +17,11 @@ from iort_analysis.archive.writing import Piece
 from iort_contract.archive import Hour
 from iort_contract.catalog.streams import ACCOUNT_STREAM, TYPES_STREAM
 from iort_contract.dynamodb import Item, plain
+from iort_contract.limits import MAX_SAMPLES
 from iort_contract.messages.account import StreamAccount, account
 from iort_contract.messages.batch import MAX_BYTES, batch_id, decode_batch
-from iort_contract.recordings.rosbag import Unread
-from iort_contract.ros.message import RosMessage
+from iort_contract.recordings.rosbag import Kind, Unread
+from iort_contract.ros.message import RosMessage, RosType
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS
 from iort_station.imports.batches import FIRST_US, Run, Times
 from iort_station.imports.choice import Choice
@@ -184,3 +185,52 @@ def test_times_that_nobody_believes_are_left_out_and_counted(tmp_path: Path) -> 
     assert run.counts["vesc"].stored == 1
     batch = decode_batch(plain(store.stored[ACCOUNT_STREAM][-1]))
     assert '{"vesc.not_a_time":2}' in batch.columns.get("counts", ())
+
+
+def kind_of(name: str, definition: str) -> Kind:
+    kind = RosType("/x", f"std_msgs/{name}", "ab" * 16, definition)
+    return Kind("x", kind, None, stamped=False, large=None)
+
+
+def taken(messages: Sequence[tuple[Kind, int, bytes]]) -> tuple[Kept, Run]:
+    store = Kept(takes_pieces=True)
+    run = Run(Topics(), RUN, store, Times(FIRST_US, last_us()), RETENTION_S)
+    for kind, t_ns, raw in messages:
+        run.message(kind, t_ns, raw)
+    run.end("import drive.bag", {})
+    return store, run
+
+
+def test_two_types_of_a_topic_are_numbered_as_recorded() -> None:
+    """Wherever the memory has them: another import has them elsewhere."""
+    kinds = sorted([kind_of("A", "int32 a"), kind_of("B", "int32 b")], key=id)
+    for first, second in (kinds, kinds[::-1]):
+        messages = [
+            (kind, START_NS // 10**9 * 10**9 + i * 10**8, bytes(4)) for i, kind in enumerate((first, second))
+        ]
+        (piece,) = taken(messages)[0].pieces["x"]
+        assert [batch_id(key).seq for key, _ in piece[2]] == [0, 1]
+
+
+def test_two_definitions_with_one_hash_are_each_read_by_their_own() -> None:
+    kinds = [kind_of("A", "int32 a"), kind_of("A", "float32 b")]
+    store, _ = taken([(kind, START_NS, bytes(4)) for kind in kinds])
+    ((_, piece, _),) = store.pieces["x"]
+    assert set(piece.kinds) == {"a", "b"}
+
+
+def test_a_topic_whose_clock_stands_still_does_not_wait() -> None:
+    kind = kind_of("A", "int32 a")
+    many = 4 * MAX_SAMPLES
+    store = Kept(takes_pieces=True)
+    run = Run(Topics(), RUN, store, Times(FIRST_US, last_us()), RETENTION_S)
+    for _ in range(many):
+        run.message(kind, START_NS, bytes(4))
+    assert sum(len(one.table) for _, one, _ in store.pieces["x"]) == many
+
+
+def test_messages_without_content_and_with_impossible_times() -> None:
+    kind = kind_of("Empty", "")
+    store, run = taken([(kind, t_ns, b"") for t_ns in (START_NS, 2**64 - 1, 0, START_NS + 1000)])
+    assert of_pieces(store)["x"] == [(START_NS // 1000, b""), (START_NS // 1000 + 1, b"")]
+    assert run.without_time == {"x": 2}

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+from mcap.writer import CompressionType, Writer
 
 from iort_station.cost.imports import Imported, archive_units, dollars, table_units
 from iort_station.errors import UsageError
 from iort_station.imports.choice import Choice
-from iort_station.imports.plan import recordings
+from iort_station.imports.plan import recordings, said_robot
 
 
 def test_paths_stand_for_recordings(tmp_path: Path) -> None:
@@ -51,6 +53,12 @@ def test_streams_are_named_as_init_names_them() -> None:
         "/agent": "topic-agent",
     }
     assert left_out == {"/rosout": "ROS' own", "/_hidden/a": "ROS' own"}
+    # Names that ROS would not have.
+    odd = dict.fromkeys(("/a b", "/ä", "", "odom", "/odom"), "std_msgs/msg/String")
+    chosen, left_out = Choice().of(odd)
+    assert {topic: one.stream for topic, one in chosen.items()} == {"/odom": "odom"}
+    assert left_out["odom"] == "its stream odom is that of /odom: --config can name another"
+    assert all("is none of ROS'" in left_out[topic] for topic in ("/a b", "/ä", ""))
     only, _ = Choice(only=("/camera/*",)).of(there)
     assert list(only) == ["/camera/info"]
     with pytest.raises(UsageError, match="has no such topic"):
@@ -64,3 +72,32 @@ def test_the_archive_costs_less_than_the_table() -> None:
     # Items of 33 KB, each written with its second, and read three times.
     writes, reads = 18_000 * (33 + 1) * 0.705e-6, 3 * 18_000 * 9 * 0.141e-6
     assert dollars(table_units(one, 90))[0] == pytest.approx(writes + reads, rel=0.01)
+
+
+def test_patterns_and_links_are_taken_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.bag", "of [1].bag", "x/y/z/b.bag"):
+        (file := tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("")
+    assert list(recordings(["*.bag"])) == [tmp_path / "a.bag", tmp_path / "of [1].bag"]
+    assert list(recordings(["of [1].bag"])) == [tmp_path / "of [1].bag"]
+    assert list(recordings(["x/*/*/b.bag"])) == list(recordings(["x/**/*.bag"])) == [tmp_path / "x/y/z/b.bag"]
+    # Links that go round, and that lead nowhere; and what only has the name of a recording.
+    (tmp_path / "x" / "round").symlink_to(tmp_path / "x")
+    (tmp_path / "x" / "again").symlink_to(tmp_path / "x" / "y")
+    (tmp_path / "x" / "gone.bag").symlink_to(tmp_path / "none.bag")
+    os.mkfifo(tmp_path / "x" / "pipe.bag")
+    assert list(recordings(["x"])) == [tmp_path / "x/y/z/b.bag"]
+
+
+def test_a_damaged_index_says_no_robot(tmp_path: Path) -> None:
+    with (path := tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        writer.add_metadata("incident", {"agent": '{"robot": "car3"}'})
+        writer.finish()
+    assert said_robot(path) == "car3"
+    content = path.read_bytes()
+    for at in range(8, len(content) - 8):
+        path.write_bytes(content[:at] + b"\xff" + content[at + 1 :])
+        assert said_robot(path) in {"", "car3"} or at in range(content.index(b"car3"), len(content))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import pytest
 
 from iort_contract.recordings import RecordingError
-from iort_contract.recordings.files import Reader
+from iort_contract.recordings.files import INDEX, Reader
 from iort_contract.recordings.rosbag import Recording, Unread
 from iort_contract.recordings.scan import Scan
 from testkit.bags import STREAMS, TOPICS, written
 
 SECONDS = 3.0
+MCAP, BAG = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
 ALL = sum(int(SECONDS * topic.hz) for topic in TOPICS)
 
 
@@ -105,3 +107,33 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, content: bytes, problem
 def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"has \.mcap or \.db3 files, and this one has none"):
         Scan(tmp_path)
+
+
+def _chunk(kind: str, said: bytes) -> bytes:
+    """A chunk of MCAP, or of a bag, that says that it is compressed so."""
+    if kind == "bag":
+        head = b"".join(struct.pack("<I", len(one)) + one for one in (b"op=\5", b"compression=" + said))
+        return struct.pack("<I", len(head)) + head + struct.pack("<I", 40) + bytes(range(40))
+    return (
+        struct.pack("<BQ28xI", 6, 60 + len(said), len(said))
+        + said
+        + struct.pack("<Q20s", 20, bytes(range(20)))
+    )
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content"),
+    [
+        *[("mcap", MCAP + _chunk("mcap", kind)) for kind in (b"zstd", b"lz4", b"bz2", b"none at all")],
+        *[("bag", BAG + _chunk("bag", kind)) for kind in (b"zstd", b"lz4", b"bz2", b"none at all")],
+        # Larger than any memory, and than any number.
+        *[("mcap", MCAP + struct.pack("<BQ", 6, size) + bytes(50)) for size in (2**62, 2**64 - 1)],
+        ("mcap", MCAP + struct.pack("<BQ28xI4sQ", 6, 44, 4, b"zstd", 2**64 - 1)),
+        ("bag", BAG + struct.pack("<I", 2**32 - 1) + b"x"),
+    ],
+)
+def test_what_no_record_can_be_ends_the_recording(tmp_path: Path, suffix: str, content: bytes) -> None:
+    (path := tmp_path / f"a.{suffix}").write_bytes(content)
+    (scan := Scan(path)).open()
+    assert (scan.connections, scan.counts()) == ([], {INDEX: {}})
+    assert f"{path}: good until byte " in scan.end
