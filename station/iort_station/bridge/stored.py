@@ -18,6 +18,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
+import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Channel, Schema
@@ -42,8 +43,10 @@ from iort_station.fleet import files
 BOOKKEEPING = {ACCOUNT_STREAM, TYPES_STREAM}
 _AT_ONCE = 8
 _BY_TIME = attrgetter("t_ns")
-# What the library raises for a file that is no MCAP, or that was damaged.
-_UNREADABLE = (OSError, McapError, EOFError, ValueError, struct.error)
+# What the library raises for a file that is no MCAP, or that was damaged; a RuntimeError is lz4's.
+_UNREADABLE = (OSError, McapError, EOFError, ValueError, struct.error, zstandard.ZstdError, RuntimeError)
+# A chunk is unpacked in memory: 30 KB may become gigabytes.
+MOST_CHUNK_BYTES = 256 * 1024 * 1024
 
 
 class Cancelled(Exception):  # noqa: N818 - no fault
@@ -248,8 +251,13 @@ class McapFile(Source):
             if topic not in self.topics:
                 self.topics.append(topic)
             self._numbers[channel.id] = self.topics.index(topic)
-        chunks = (index.uncompressed_size for index in summary.chunk_indexes)
-        self.largest_bytes = max(chunks, default=1) // 16
+        chunk_bytes = max((index.uncompressed_size for index in summary.chunk_indexes), default=1)
+        if chunk_bytes > MOST_CHUNK_BYTES:
+            size = f"{chunk_bytes // 2**20:,} MB, at most {MOST_CHUNK_BYTES // 2**20} MB are read"
+            raise StationError(
+                f"{path} has a chunk of {size}: `mcap filter` of the program mcap writes smaller ones"
+            )
+        self.largest_bytes = chunk_bytes // 16
 
     def messages(
         self, start_ns: int, wanted: frozenset[int], _check: Callable[[], None], _say: Callable[[str], None]

@@ -6,6 +6,7 @@ import { FIELD_TABLE, type HistoryAnswer } from "../src/base/contract";
 import { lastAt } from "../src/base/range";
 import { together } from "../src/history/chart";
 import { Past } from "../src/history/past";
+import { harmless } from "../src/history/rows_panel";
 import type { Fleet } from "../src/live/fleet";
 
 const fleet = { speed: () => undefined } as unknown as Fleet;
@@ -76,4 +77,10 @@ test("a key without a stream is of the main one", () => {
   assert.deepEqual(of.parse("pose/x"), ["pose", "x"]);
   assert.deepEqual([of.key("vesc", "speed"), of.key("pose", "x")], ["speed", "pose/x"]);
   assert.equal(of.label("pose/x"), "X, pose");
+});
+
+test("a robot's text is no formula in what is copied", () => {
+  for (const text of ["=1+1", "@SUM(A1)", "+1", "-1", " \t=1", "\r\n=1", "\uff1d1"])
+    assert.equal(harmless(text), `'${text}`);
+  for (const text of ["", "idle", "a=1", "1-2", "'=1"]) assert.equal(harmless(text), text);
 });

@@ -343,6 +343,22 @@ def test_the_arrangement_is_kept_and_shared_by_its_link(show, url, open_page):
     until(lambda: "fields=" not in page.url and len(page.evaluate(labels)) > 2, "the usual panels again")
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        "map:constructor,table:__proto__,xy:toString:constructor/x,speed~constructor/x,hasOwnProperty,speed",
+        "map:pose:__proto__/x,map::,xy:speed,table:,xy:speed:speed:speed,~~,/,:,a/b/c,speed",
+        "%3Cimg%20src=x%20onerror=window.hacked=1%3E/x,table:%3Cscript%3E,map:vesc:speed,speed",
+    ],
+)
+def test_a_link_of_odd_panels_shows_those_that_there_are(show, fields):
+    page = show(fields)
+    until(page.locator("section[aria-label='Speed']").is_visible, "the panel that there is")
+    assert page.evaluate("window.hacked") is None
+    page.get_by_role("button", name="Reset").click()
+    until(lambda: "fields=" not in page.url, "the usual panels")
+
+
 def test_arrow_keys_move_the_cursor_on_the_way_and_rest_there(show):
     page = show("map:pose:speed,speed")
     page.locator(f"{MAP} [role=img]").focus()
@@ -420,10 +436,12 @@ def test_the_condition_is_of_what_the_car_sends(open_page, server):
     page = open_page(server.invitation("#/history/car-1?fields=duty_cycle,speed"), timezone_id="UTC")
     for label, threshold, condition in (
         ("Duty cycle", "50", "duty_cycle < 0.5"),
+        ("Duty cycle", "48.1371543", "duty_cycle < 0.481371543"),
         ("Speed", "2", "speed_mps < 2"),
     ):
         chart = page.locator(f"section[aria-label='{label}']")
-        chart.get_by_label("Alarm", exact=True).click()
+        if chart.locator(".alarm-form").is_hidden():
+            chart.get_by_label("Alarm", exact=True).click()
         chart.get_by_label("When it is").select_option("<")
         chart.get_by_label("for").fill("0")
         chart.locator(".alarm-form").get_by_label("Threshold").fill(threshold)

@@ -148,7 +148,8 @@ export class AlarmForm {
     const speed = field === "speed" && spec.unit === "m/s" && spec.scale !== 1;
     const sent = speed ? value : (value - spec.shift) / spec.scale;
     const span = this.span.valueAsNumber;
-    return `${speed ? "speed_mps" : field} ${this.sign.value} ${Number(sent.toPrecision(6))}${span > 0 ? ` for ${span}s` : ""}`;
+    // As typed: a latitude or a count has more than a few digits, and a scale leaves noise in the last ones.
+    return `${speed ? "speed_mps" : field} ${this.sign.value} ${Number(sent.toPrecision(12))}${span > 0 ? ` for ${span}s` : ""}`;
   }
 
   private asked(): Readonly<Record<string, string>> {

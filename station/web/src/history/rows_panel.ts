@@ -190,7 +190,7 @@ export class RowsPanel implements Panel<Past> {
 
   /** Copy all rows of the range, in their order, in the units that are shown. */
   private async copy(): Promise<void> {
-    const quoted = (text: string): string => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+    const quoted = (text: string): string => (/[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
     const head = [
       "time",
       ...this.columns.map(({ name, spec }) => (spec.unit ? `${name} (${spec.unit})` : name)),
@@ -217,11 +217,16 @@ function iso(at: number): string {
   return `${second}.${String(us % 1e6).padStart(6, "0")}Z`;
 }
 
-/** A value as a file has it: a plain number in the unit that is shown. */
+/** A value as a file has it: a plain number in the unit that is shown, or a text. */
 function plain(value: Value, { scale, shift }: Spec): string {
   if (value === null) return "";
-  return typeof value === "number" ? String(Number((value * scale + shift).toPrecision(12))) : String(value);
+  return typeof value === "number"
+    ? String(Number((value * scale + shift).toPrecision(12)))
+    : harmless(String(value));
 }
+
+/** A robot's text that is no formula where it is pasted: as in the server's files, by OWASP. */
+export const harmless = (text: string): string => (/^\s*[=+\-@＝＋－＠]/.test(text) ? `'${text}` : text);
 
 /** Numbers before texts, and what is missing last, whatever the `sign` of the order. */
 function compared(one: Value, other: Value, sign: number): number {
