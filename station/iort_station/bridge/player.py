@@ -47,6 +47,8 @@ _SHOWN_NS = 1_000_000_000
 # Clients are told the time so often.
 _TIME_S = 1 / 30
 _PROBLEM = "reading"
+# Without a network a request takes minutes to fail: Ctrl-C does not wait for it.
+_GOODBYE_S = 3.0
 
 
 class Audience(Protocol):
@@ -114,7 +116,7 @@ class Player:
             self._reading += 1
             self._changed.notify_all()
         for thread in self._threads:
-            thread.join()
+            thread.join(_GOODBYE_S)
 
     # Called in threads of the sdk, which must not wait.
 

@@ -12,7 +12,7 @@ from iort_station.bridge.channels import Level, Message, Topic
 from iort_station.bridge.player import FASTEST, Player
 from iort_station.bridge.stored import Cancelled, Source
 from iort_station.errors import StationError
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 
 SECOND = 10**9
 TOPIC = Topic("/t", "json", "t", "jsonschema", b"{}")
@@ -163,6 +163,25 @@ def test_while_paused_each_topic_shows_its_first_message_and_who_comes_later_see
         until(audience.ended)
     after = [(one.t_ns // SECOND, one.topic) for one in audience.got[3:]]
     assert after == [(i, topic) for i in range(41, 100) for topic in (0, 1)]
+
+
+def test_the_end_does_not_wait_for_a_reading_that_hangs() -> None:
+    reads, answers = threading.Event(), threading.Event()
+
+    def hold(_i: int) -> None:
+        reads.set()
+        answers.wait()
+
+    audience = Audience(0)
+    source = Ticks(100, hold=hold)
+    with Player(source, audience):
+        assert reads.wait(GUARD_S)
+    # Without a network it would take minutes. What comes after that goes to nobody.
+    assert not source.closed
+    answers.set()
+    until(lambda: source.closed)
+    assert audience.got == []
+    assert audience.said == []
 
 
 @pytest.mark.parametrize("error", [StationError("the table is away"), KeyError("odd")])
