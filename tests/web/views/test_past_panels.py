@@ -336,8 +336,9 @@ def test_the_arrangement_is_kept_and_shared_by_its_link(show, url, open_page):
     other = open_page(link, timezone_id="UTC")
     until(lambda: other.evaluate(labels) == arranged, "what is shared")
     # A link changes nothing that is kept.
+    # A visit of its own: in the same one the panels that are shown stay, and are written into the address.
+    other.goto("about:blank")
     other.goto(f"{url}#/history/car?stream=vesc&{RANGE}")
-    other.reload()
     until(lambda: len(other.evaluate(labels)) > 2, "the usual panels")
     page.get_by_role("button", name="Reset").click()
     until(lambda: "fields=" not in page.url and len(page.evaluate(labels)) > 2, "the usual panels again")
