@@ -71,6 +71,10 @@ def starting_between(first_us: int | None, last_us: int | None) -> Keys:
     return Keys({"S": first}, {"S": last}, first > last)
 
 
+# The keys of all batches.
+ALL = starting_between(None, None)
+
+
 def with_samples_between(start_us: int | None, end_us: int | None) -> Keys:
     """The keys of batches that may hold samples from ``start_us`` to ``end_us`` (exclusive); None is open."""
     # A batch may start almost one batch length before its last sample.

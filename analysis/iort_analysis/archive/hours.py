@@ -25,7 +25,7 @@ from iort_contract.archive import (
     refused_key,
 )
 from iort_contract.checks import shown
-from iort_contract.dynamodb import Keys, TelemetryTable, plain
+from iort_contract.dynamodb import ALL, Keys, TelemetryTable, plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, batch_id, run_ends
 from iort_contract.objects import code_of
@@ -156,7 +156,7 @@ class HourFile:
         """The batches with these keys."""
         if self._row.batches and self._file.has_messages(self._hour):
             # Values that were not finite are counted as messages are decoded.
-            return list(batches_of(within(self.items(), keys), wanted))
+            return list(batches_of(self.items(keys), wanted))
         block = join([part.block for part in self.parts(wanted, messages=True, keys=keys)])
         times, columns = block.times_us.tolist(), {n: values(column) for n, column in block.columns.items()}
         batches, first = [], 0
@@ -178,13 +178,13 @@ class HourFile:
         batches = [key for key, _ in self._file.hashes(self._hour)] if self._row.batches else []
         return sorted([*batches, *map(key_of, self._refused())])
 
-    def items(self) -> list[Item]:
-        """Everything that was stored, in order; what is not a batch byte for byte."""
+    def items(self, keys: Keys = ALL) -> list[Item]:
+        """Everything that was stored with these keys, in order; what is not a batch byte for byte."""
         # It takes longer to load than most commands to run.
         from iort_analysis.archive.reading import items  # noqa: PLC0415 - see above
 
-        batches = items(self._file, self._row.topic, self._hour) if self._row.batches else ()
-        return sorted([*batches, *self._refused()], key=key_of)
+        batches = items(self._file, self._row.topic, self._hour, keys) if self._row.batches else ()
+        return sorted([*batches, *within(self._refused(), keys)], key=key_of)
 
     @cached_property
     def _file(self) -> ArchiveFile:

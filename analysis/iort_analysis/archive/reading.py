@@ -17,7 +17,7 @@ from iort_analysis.samples.batches import Part, Wanted
 from iort_analysis.samples.blocks import Block, Column, column_of
 from iort_contract.archive import Hour
 from iort_contract.codec import CODEC, packed_samples
-from iort_contract.dynamodb import Item, Keys, starting_between
+from iort_contract.dynamodb import ALL, Item, Keys
 from iort_contract.limits import BATCH_VERSION, Value
 from iort_contract.messages.batch import batch_id
 from iort_contract.ros.message import Messages, pack
@@ -25,7 +25,6 @@ from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, RECEIVED_MS, SAMPLE
 
 # In the file's metadata: the first row group and the number of them by hour, and the fields' kinds.
 HOURS, KINDS = b"iort:hours", b"iort:kinds"
-ALL = starting_between(None, None)
 _HEAD = (names.BATCH_ID, names.RECEIVED, names.NOT_FINITE, names.PREVIOUS_RUNS, names.HASH)
 
 
@@ -52,12 +51,10 @@ class ArchiveFile:
         """The samples in the file."""
         return int(self._file.metadata.num_rows)
 
-    def groups(self, hour: Hour | None = None) -> range:
-        """The row groups of an hour."""
-        if hour is None:
-            return range(self._file.num_row_groups)
-        first, count = self._hours.get(str(hour), (0, 0))
-        return range(first, first + count)
+    def groups(self, hour: Hour | None = None, keys: Keys = ALL) -> list[int]:
+        """The row groups of an hour that may have batches with these keys."""
+        first, count = (0, self._file.num_row_groups) if hour is None else self._hours.get(str(hour), (0, 0))
+        return [group for group in range(first, first + count) if self._overlaps(group, keys)]
 
     def pages(
         self,
@@ -71,8 +68,8 @@ class ArchiveFile:
         batches; `in_order` brings them into the order of time. Without ``messages``, batches of ROS messages
         are left out.
         """
-        for group in self.groups(hour):
-            if self._overlaps(group, keys) and (part := self._part(group, wanted, keys, messages=messages)):
+        for group in self.groups(hour, keys):
+            if part := self._part(group, wanted, keys, messages=messages):
                 yield part
 
     def span(self, hour: Hour) -> tuple[int, int]:
@@ -193,17 +190,19 @@ def head_of(table: Any, row: int) -> Item:
 _LEVEL = 1
 
 
-def items(file: ArchiveFile, topic: str, hour: Hour | None = None) -> Iterator[Item]:
-    """The batches of a file as stored items.
+def items(file: ArchiveFile, topic: str, hour: Hour | None = None, keys: Keys = ALL) -> Iterator[Item]:
+    """The batches of a file with these keys as stored items; only their row groups are read.
 
     They decode to the same batches and ROS messages as the stored ones, but may be compressed in another way;
     each has the hash of the stored one as the contract's `HASH`.
     """
-    for group in file.groups(hour):
+    for group in file.groups(hour, keys):
         table = file.table(group)
         ids, rows = runs(table[names.BATCH_ID])
         columns = _Columns(file.kinds, table)
         for i, batch in enumerate(ids):
+            if not keys.first["S"] <= batch <= keys.last["S"]:
+                continue
             start, end = int(rows[i]), int(rows[i + 1])
             codec, samples = columns.samples(start, end)
             yield {

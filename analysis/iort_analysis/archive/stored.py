@@ -159,8 +159,10 @@ class Stored:
         """Pages of the stored items with these keys, also of those that are not batches. Those from the
         archive decode to the same batches and messages as the stored ones. ``page_items`` is the most items
         of a page of the table."""
-        for found in self._found(keys, HourFile.items, attributes, page_items=page_items, progress=progress):
-            yield within(found.content, keys) if isinstance(found, _Archived) else found
+        for found in self._found(
+            keys, lambda hour: hour.items(keys), attributes, page_items=page_items, progress=progress
+        ):
+            yield found.content if isinstance(found, _Archived) else found
 
     def headers(self, keys: Keys, attributes: Sequence[str] = HEADER) -> Iterator[Item]:
         """The stored items with these keys; those of the archive without their samples."""
@@ -300,7 +302,7 @@ class Stored:
         if not beside and content is not None:
             return _Archived(content)
         # Rare and slow: batches that came late, or items that are not batches.
-        return within(merged(beside, self._archive.read(row, HourFile.items)), keys)
+        return within(merged(beside, self._archive.read(row, lambda hour: hour.items(keys))), keys)
 
     def _from_archive(self, batch: BatchId) -> BatchId:
         self.origin.hours.append(hour_of(batch.t_us))

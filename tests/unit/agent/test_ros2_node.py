@@ -86,7 +86,8 @@ def test_a_request_is_patient_only_where_the_middleware_has_room_for_what_comes_
 
 def test_a_topic_is_patient_until_somebody_wants_its_messages_at_once() -> None:
     desk = Desk()
-    ring, bodies = desk.topic.takers, list[bytes]()
+    bodies: list[bytes] = []
+    ring = desk.topic.takers
     desk.topic.patient = frozenset(ring)
     publisher = desk.graph.publisher("/t", IMU)
     desk.look()

@@ -171,6 +171,19 @@ def test_what_is_not_wanted_is_not_read():
     assert not list(file.pages(keys=starting_between(None, HOUR.start_us - 1)))
 
 
+def test_only_the_parts_with_the_wanted_batches_are_read(monkeypatch):
+    monkeypatch.setattr(writing, "_ROWS", 30)
+    batches = [batch_at(HOUR, second, {"speed": [1.0, 2.0, 3.0]}, seq=second) for second in range(1000)]
+    file, _, _ = written(list(map(item_of, batches)))
+    keys = starting_between(batches[400].times_us[0], batches[404].times_us[0])
+    assert len(file.groups()) > 5
+    assert len(file.groups(HOUR, keys)) <= 2
+    some = list(stored_again(file, TOPIC_OF_CAR, HOUR, keys))
+    assert [item[BATCH]["S"] for item in some] == [str(batch.id) for batch in batches[400:405]]
+    every = {item[BATCH]["S"]: item for item in stored_again(file, TOPIC_OF_CAR, HOUR)}
+    assert all(every[item[BATCH]["S"]] == item for item in some)
+
+
 def test_much_text_does_not_stay_in_memory_for_an_hour(monkeypatch):
     monkeypatch.setattr(writing, "_BYTES", 100_000)
     items = [item_of(batch_at(HOUR, i, {"log": ["x" * 4000] * 3}, seq=i)) for i in range(300)]
