@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -43,6 +44,9 @@ from iort_station.fleet import files
 BOOKKEEPING = {ACCOUNT_STREAM, TYPES_STREAM}
 _AT_ONCE = 8
 _BY_TIME = attrgetter("t_ns")
+# A range is read in parts, which grow: an hour of the archive is read as one, and may have gigabytes, and the
+# first message must not wait for the last one.
+_FIRST_US, _GROWS, _MOST_US = 10_000_000, 4, 160_000_000
 # What the library raises for a file that is no MCAP, or that was damaged; a RuntimeError is lz4's.
 _UNREADABLE = (OSError, McapError, EOFError, ValueError, struct.error, zstandard.ZstdError, RuntimeError)
 # A chunk is unpacked in memory: 30 KB may become gigabytes.
@@ -126,15 +130,19 @@ class Range(Source):
 
     def _look(self, selection: Selection) -> _Found | None:
         recorded = Recorded(self._cloud, selection.robot, selection.stream)
-        with closing(samples(self._cloud, selection, recorded)) as blocks:
-            block = next(blocks, None)
+        part, block = selection, None
+        for part in _parts(selection, most_us=None):
+            with closing(samples(self._cloud, part, recorded)) as blocks:
+                block = next(blocks, None)
+            if block is not None:
+                break
         if block is None:
             return None
         end_us = selection.end_us
         if end_us is None and (last := recorded.before(None)) is not None:
             tail = recorded.parts(with_samples_between(last.t_us, None))
             end_us = 1 + max(int(part.block.times_us.max()) for part in tail if len(part.block.times_us))
-        export = self._export(selection)
+        export = self._export(part)
         found = export.first()
         return _Found(
             int(block.times_us[0]),
@@ -187,15 +195,17 @@ class Range(Source):
         self, stream: _Stream, selection: Selection, check: Callable[[], None], say: Callable[[str], None]
     ) -> Generator[Message, None, None]:
         recorded, absent = Recorded(self._cloud, stream.robot, stream.stream), Counter[str]()
-        blocks = samples(
-            self._cloud, selection, recorded, absent=absent, progress=lambda _more, _last_us: check()
-        )
-        with closing(blocks):
-            for block in blocks:
-                columns = {name: values(column) for name, column in block.columns.items()}
-                for i, t_us in enumerate(block.times_us.tolist()):
-                    sample = {name: column[i] for name, column in columns.items()}
-                    yield Message(t_us * 1000, stream.number, fields.encoded(sample))
+        for part in _parts(selection):
+            check()
+            blocks = samples(
+                self._cloud, part, recorded, absent=absent, progress=lambda _more, _last_us: check()
+            )
+            with closing(blocks):
+                for block in blocks:
+                    columns = {name: values(column) for name, column in block.columns.items()}
+                    for i, t_us in enumerate(block.times_us.tolist()):
+                        sample = {name: column[i] for name, column in columns.items()}
+                        yield Message(t_us * 1000, stream.number, fields.encoded(sample))
         _say_refused(recorded.refused, say)
 
     def _published(
@@ -206,23 +216,37 @@ class Range(Source):
         check: Callable[[], None],
         say: Callable[[str], None],
     ) -> Generator[Message, None, None]:
-        export = self._export(selection)
-        published = export.in_order(lambda _more, _last_us: check())
-        with closing(published):
-            for t_us, name, raw in published:
-                number, form = stream.originals.get(name, (-1, None))
-                if form is None or number not in wanted:
-                    continue
-                try:
-                    yield Message(t_us * 1000, number, form.convert(raw))
-                except ConversionError as error:
-                    say(str(error))
-        _say_refused(export.refused, say)
+        for part in _parts(selection):
+            check()
+            export = self._export(part)
+            published = export.in_order(lambda _more, _last_us: check())
+            with closing(published):
+                for t_us, name, raw in published:
+                    number, form = stream.originals.get(name, (-1, None))
+                    if form is None or number not in wanted:
+                        continue
+                    try:
+                        yield Message(t_us * 1000, number, form.convert(raw))
+                    except ConversionError as error:
+                        say(str(error))
+            _say_refused(export.refused, say)
 
     def _export(self, selection: Selection) -> Export:
         types = self._types[selection.robot]
         own = {name: kind for name, kind in types.items() if kind.stream == selection.stream}
         return Export(self._cloud, selection, own, lambda key: files.content(self._cloud, key))
+
+
+def _parts(selection: Selection, *, most_us: int | None = _MOST_US) -> Iterator[Selection]:
+    """A selection's range, some at a time; an open one is read as a whole."""
+    start_us, end_us, length_us = selection.start_us, selection.end_us, _FIRST_US
+    if start_us is None or end_us is None or start_us >= end_us:
+        yield selection
+        return
+    while start_us < end_us:
+        yield replace(selection, start_us=start_us, end_us=min(end_us, start_us + length_us))
+        start_us += length_us
+        length_us = length_us * _GROWS if most_us is None else min(length_us * _GROWS, most_us)
 
 
 def _say_refused(refused: RefusedItems, say: Callable[[str], None]) -> None:

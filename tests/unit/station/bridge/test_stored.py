@@ -98,6 +98,19 @@ def test_the_archive_gives_what_the_table_gave_and_both_what_a_query_returns(clo
     assert [one.t_ns for one in after] == sorted(one.t_ns for one in after)
 
 
+def test_the_first_message_does_not_wait_for_the_rest_of_the_range(cloud: Any) -> None:
+    archive(cloud.table, cloud.bucket)
+    expire(cloud.table)
+    played = Range(cloud, ["car"], START, START + SECONDS * 1_000_000)
+    reads: list[None] = []
+    every = frozenset(range(len(played.topics)))
+    messages = played.messages(played.start_ns, every, lambda: reads.append(None), lambda _text: None)
+    next(messages)
+    before = len(reads)
+    assert sum(1 for _ in messages) > SECONDS // 10
+    assert before < len(reads) / 5
+
+
 def test_topics_of_several_robots_begin_with_their_names(cloud: Any) -> None:
     recorded(cloud, "car2")
     source = Range(cloud, ["car", "car2"], None, None)
