@@ -190,7 +190,8 @@ export class RowsPanel implements Panel<Past> {
 
   /** Copy all rows of the range, in their order, in the units that are shown. */
   private async copy(): Promise<void> {
-    const quoted = (text: string): string => (/[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+    const quoted = (text: string): string =>
+      /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
     const head = [
       "time",
       ...this.columns.map(({ name, spec }) => (spec.unit ? `${name} (${spec.unit})` : name)),
