@@ -34,7 +34,7 @@ def test_the_last_minute_is_kept_listed_and_downloaded(embedded, bundle, open_pa
         page.get_by_text(f"{car.robot} keeps them, and uploads them.").wait_for()
         page.locator(".incidents-list [data-state=uploaded]").wait_for()
         with page.expect_download() as loading:
-            page.locator(".incidents-list").get_by_role("button").click()
+            page.locator(".incidents-list").get_by_role("button", name="Download").click()
         loading.value.save_as(tmp_path / "file.mcap")
         page.goto(f"{server.url}#/")
         until(lambda: page.locator(".incidents-badge").first.inner_text() == "1 incident", "the badge")
