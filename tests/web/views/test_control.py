@@ -142,7 +142,7 @@ def test_a_note_is_written_marked_in_the_history_and_deleted(open_page, lab, ser
     page.fill("[name=note]", "<b>hit</b> the wall")
     page.get_by_role("button", name="Add note").click()
     # About the cursor's time, and as text.
-    page.locator(".history .notes-list li").get_by_text("<b>hit</b> the wall").wait_for()
+    page.locator(".history .notes-list li[data-note]").get_by_text("<b>hit</b> the wall").wait_for()
     assert abs(lab.notes[-1]["t_us"] - 1_777_888_830_000_000) < 500_000
     drawn(page)
     assert chart.screenshot() != before
@@ -150,10 +150,10 @@ def test_a_note_is_written_marked_in_the_history_and_deleted(open_page, lab, ser
     page.goto(f"{server.url}#/insights/car-1")
     page.locator(".insights-view .notes-list a").last.click()
     page.locator(".scrub-at").filter(has_text="10:00:").wait_for()
-    page.locator(".history .notes-list li").wait_for()
+    page.locator(".history .notes-list li[data-note]").wait_for()
     for word in ("Delete", "Really"):
         page.locator(".history .notes-list").get_by_role("button").filter(has_text=word).click()
-    until(lambda: page.locator(".history .notes-list li").count() == 0, "no note")
+    until(lambda: page.locator(".history .notes-list li[data-note]").count() == 0, "no note")
     assert [one["text"] for one in lab.notes] == ["changed the left front tyre"]
 
 
