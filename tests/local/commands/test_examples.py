@@ -24,11 +24,13 @@ from tests.local.data.drives import Agent
 from tests.manual import COMMANDS, examples
 
 # Commands that need what an embedded cloud does not have, or that change what other tests use.
-# Laps and a calibration need minutes of driving, `iort drive` a terminal, and `iort invite` a page.
+# Laps and a calibration need minutes of driving, `iort drive` a terminal, and `iort invite` a page. `iort
+# bridge` runs until Ctrl-C.
 NOT_RUN = {
     *(
         "ask",
         "backup",
+        "bridge",
         "dashboard",
         "drive",
         "files empty",

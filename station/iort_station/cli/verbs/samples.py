@@ -184,7 +184,7 @@ _BOOKKEEPING = {ACCOUNT_STREAM, TYPES_STREAM}
         "export car7 vesc --last 10m --out car7.mcap",
         "export car7 --last 10m --out all.mcap",
         "export car7 --last 10m --out ride/",
-        "export car7 --format lerobot --last 30d --cameras camera --out dataset/",
+        "export car7 --format lerobot --episodes runs --action vesc.duty_cycle --out dataset/",
     ),
 )
 @learned
