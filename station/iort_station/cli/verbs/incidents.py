@@ -147,16 +147,15 @@ def _failed(one: RobotIncident) -> bool:
 
 def _table(found: list[RobotIncident]) -> Any:
     left = ("begin (UTC)", "robot", "trigger", "state", "id")
-    shown = table("begin (UTC)", "robot", "length", "trigger", "state", "size", "missing", "id", left=left)
-    # A long name takes a second line.
-    for name in (1, 3):
-        shown.columns[name].no_wrap, shown.columns[name].min_width = False, 6
+    shown = table("begin (UTC)", "robot", "trigger", "state", "size", "missing", "id", left=left)
+    # In a narrow terminal the time takes a second line, and long names do.
+    for column, least in ((0, 10), (1, 4), (2, 4)):
+        shown.columns[column].no_wrap, shown.columns[column].min_width = False, least
     for one in found:
         incident = one.incident
         shown.add_row(
             iso_s(incident.from_us).replace("T", " ")[:-1],
             one.robot,
-            f"{(incident.to_us - incident.from_us) / 1e6:.0f} s",
             incident.trigger,
             _state(incident),
             size(incident) if incident.bytes else "",
