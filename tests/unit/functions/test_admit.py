@@ -24,7 +24,7 @@ from iort_contract.tables import (
 )
 from testkit.dynamodb import ROBOTS
 
-LATER_S = int(time.time()) + 3600
+LATER_S = int(time.time()) + 86_400
 
 
 def request(robot="car", serial="s1", certificate="new", claim="claim"):

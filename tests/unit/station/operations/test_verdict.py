@@ -16,7 +16,6 @@ from tests.unit.station.data.test_queries import START, TOPIC, cloud_of
 
 S = 1_000_000
 ACCOUNTS = build_topic(RECORD, "car", ACCOUNT_STREAM)
-NOW_MS = time.time_ns() // 1_000_000
 
 
 def run(boot="0badcafe", start=START, n=10, *, without=(), previous=None):
@@ -87,9 +86,15 @@ def test_nothing_stored_is_unknown():
     assert word([], []).why == ("nothing of car vesc is stored",)
 
 
-def test_a_run_that_goes_on_is_unknown_at_its_end_alone():
-    now = NOW_MS * 1000
-    batches, told = run(start=now - 20 * S), [report(at=now - 9 * S, ended=False, received_ms=NOW_MS)]
+@pytest.fixture
+def now_ms():
+    """When the test runs: only a run that was heard of lately goes on."""
+    return time.time_ns() // 1_000_000
+
+
+def test_a_run_that_goes_on_is_unknown_at_its_end_alone(now_ms):
+    now = now_ms * 1000
+    batches, told = run(start=now - 20 * S), [report(at=now - 9 * S, ended=False, received_ms=now_ms)]
     found = word(batches, told, now - 20 * S, now)
     assert found.word == "unknown"
     assert "goes on: the robot may hold batches that come later" in found.why[0]
@@ -165,9 +170,9 @@ def test_a_run_of_which_nothing_is_stored_is_missing_where_its_reports_are():
             assert word(batches, told, START, START + 10 * S).word == "complete"
 
 
-def test_a_run_whose_batches_wait_in_the_car_is_unknown():
-    now = NOW_MS * 1000
-    told = [report(), report("1badcafe", now - 9 * S, ended=False, received_ms=NOW_MS)]
+def test_a_run_whose_batches_wait_in_the_car_is_unknown(now_ms):
+    now = now_ms * 1000
+    told = [report(), report("1badcafe", now - 9 * S, ended=False, received_ms=now_ms)]
     found = word(run(), told, now - 20 * S, now)
     assert (found.word, found.missing) == ("unknown", 0)
     assert found.why == ("run 1badcafe goes on: the robot may hold its 10 batches",)
