@@ -25,7 +25,7 @@ from iort_station.data.recorded import select
 from iort_station.errors import StationError
 from testkit.dynamodb import ROBOTS, TELEMETRY, item_of
 from testkit.waiting import until
-from tests.bridge.judge import PAUSED, PLAYING, Judge
+from tests.bridge.judge import PAUSED, PLAYING, Got, Judge
 from tests.unit.station.data.test_queries import START, cloud_of
 
 START_NS = START * 1000
@@ -106,9 +106,11 @@ def samples(found: Any) -> set[tuple[int, str]]:
     return {(t_ns, json.dumps(flat(fields), sort_keys=True)) for t_ns, fields in found}
 
 
-def queried(cloud: Any, stream: str, start_us: int) -> set[tuple[int, str]]:
+def queried(
+    cloud: Any, stream: str, start_us: int, end_us: int = START + HOUR_S * 1_000_000
+) -> set[tuple[int, str]]:
     """What `iort query` returns."""
-    found = data.query(cloud, "car", stream, start_us, START + HOUR_S * 1_000_000)
+    found = data.query(cloud, "car", stream, start_us, end_us)
     columns = {name: data.values(column) for name, column in found.columns.items()}
     return samples(
         (t_us * 1000, {name: column[i] for name, column in columns.items()})
@@ -151,21 +153,36 @@ def test_after_a_seek_come_exactly_the_samples_of_a_query(
     seek_us = START + (HOUR_S - seconds) * 1_000_000 - 55_000
     began = judge.play("seek", seek_ns=seek_us * 1000, speed=speed)
     judge.ended(began)
+
+    def sought(topic: str) -> list[Got]:
+        return [one for one in judge.got(topic, after=began) if one.t_ns >= seek_us * 1000]
+
     for stream in STREAMS:
         expected_samples = queried(hour, stream, seek_us)
         # The state of the end may overtake the last messages.
-        until(lambda: len(list(judge.got(f"/iort/{stream}", after=began))) >= len(expected_samples))  # noqa: B023 - within the loop
-        found = [(one.t_ns, one.fields) for one in judge.got(f"/iort/{stream}", after=began)]
+        until(lambda: len(sought(f"/iort/{stream}")) >= len(expected_samples))  # noqa: B023 - within the loop
+        found = [(one.t_ns, one.fields) for one in sought(f"/iort/{stream}")]
         assert len(found) >= 10
         assert samples(found) == expected_samples, stream
         assert [t_ns for t_ns, _ in found] == sorted(t_ns for t_ns, _ in found)
+    # The state of the seek may overtake the last messages of what was played before, and nothing else of it.
+    late = list(judge.got(after=began))
+    first = next(i for i, one in enumerate(late) if one.t_ns >= seek_us * 1000)
+    assert all(one.t_ns >= seek_us * 1000 for one in late[first:])
+    for stream in STREAMS:
+        # With them, it is what was played from the begin on, each sample once.
+        former = [one for one in judge.got(f"/iort/{stream}") if one.t_ns < seek_us * 1000]
+        if former:
+            played = queried(hour, stream, START, former[-1].t_ns // 1000 + 1)
+            assert samples((one.t_ns, one.fields) for one in former) == played
+            assert len(former) == len(played)
     times = [START + (second * 10 + i) * 100_000 for second in range(0, HOUR_S, 10) for i in range(10)]
     expected = [
         (t_us * 1000, raw((t_us - START) // 100_000 % 100 + (t_us - START) // 10**6 // 10 * 10))
         for t_us in times
         if t_us >= seek_us
     ]
-    assert [(one.t_ns, one.data) for one in judge.got("/lab/made", after=began)] == expected
+    assert [(one.t_ns, one.data) for one in sought("/lab/made")] == expected
 
 
 def test_a_paused_client_sees_the_first_sample_from_where_it_sought_and_gets_it_once(judge: Judge) -> None:

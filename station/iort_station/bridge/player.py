@@ -10,6 +10,9 @@ A reader reads ahead from the playhead, in a thread of its own, what clients sub
 subscription cancel what it reads; of several seeks it reads the last one. Each message is sent once between
 two seeks, when the playhead has passed it. While paused, the first message of each topic is sent before its
 time, so that a panel shows something.
+
+What waits in a client's queue at a seek follows the state that tells the seek: the sdk has one queue for
+states and one for messages, and takes from both.
 """
 
 from __future__ import annotations
@@ -98,6 +101,8 @@ class Player:
         self._shown: dict[int, int] = {}
         self._starved_s: float | None = None
         self._told_s = self._sent_s = 0.0
+        # How often clients controlled it, and how often they sought.
+        self._orders = self._seeks = 0
         # Somebody has just come, and does not know the state.
         self._tells = False
         self._threads = [
@@ -126,9 +131,11 @@ class Player:
             self._advance()
             speed = request.playback_speed
             self._speed = min(max(speed, SLOWEST), FASTEST) if speed > 0 else self._speed
+            self._orders += 1
             if request.seek_time is not None:
                 self._at_ns = min(max(request.seek_time, self._source.start_ns), self._source.end_ns)
                 self._shown.clear()
+                self._seeks += 1
                 self._read_from(self._at_ns)
             wants_play = request.playback_command == PlaybackCommand.Play
             ended = self._status is PlaybackStatus.Ended and request.seek_time is None
@@ -175,9 +182,16 @@ class Player:
                     self._tells, state = False, self._state()
                 moves = self._status is PlaybackStatus.Playing
                 at_ns, now_s = self._at_ns, self._monotonic()
+                orders, seeks = self._orders, self._seeks
             # Without the lock: a thread of the sdk may wait for it.
             for message in messages:
+                # After a seek, nothing of the place before.
+                if self._seeks != seeks:
+                    break
                 self._audience.send(message)
+            # The answer to an order is newer.
+            if self._orders != orders:
+                continue
             if moves and (now_s - self._told_s >= _TIME_S or state is not None):
                 self._told_s = now_s
                 self._audience.tell_time(at_ns)

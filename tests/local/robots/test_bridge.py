@@ -86,13 +86,14 @@ def test_a_subscription_wakes_a_car_and_its_end_lets_it_sleep_and_the_past_is_wh
         assert begin
         judge.do("subscribe", topic="/iort/vesc")
         began = judge.play("play", seek_ns=first_ns, speed=10.0)
-        until(lambda: any(one.t_ns > last_ns for one in judge.got("/iort/vesc", after=began)) or _over(judge))
-        played = {one.t_ns: one.fields for one in judge.got("/iort/vesc", after=began) if one.t_ns <= last_ns}
-    assert played == recorded
 
+        def played() -> dict[int, dict[str, Any]]:
+            # What a paused panel was shown, of the begin of the hour, may come after the state of the seek.
+            messages = judge.got("/iort/vesc", after=began)
+            return {one.t_ns: one.fields for one in messages if first_ns <= one.t_ns <= last_ns}
 
-def _over(judge: Judge) -> bool:
-    return judge.of("state")[-1]["status"] == 3
+        until(lambda: len(played()) >= len(recorded))
+        assert played() == recorded
 
 
 def test_a_panel_drives_the_car_and_the_car_stops_when_its_client_has_gone(embedded: Any, car: Any) -> None:

@@ -1,7 +1,7 @@
 """An agent with a recorder and no broker, for tests that kill it: python -m ... FOLDER.
 
-It writes a line for each message to FOLDER/sent. Its trigger fires once, after one and a half seconds, unless
-the plan knows the trigger already."""
+It writes a line for each message to FOLDER/sent. Its trigger fires once, after one and a half seconds at the
+earliest, unless the plan knows the trigger already."""
 
 from __future__ import annotations
 
@@ -32,11 +32,14 @@ def main(folder: Path) -> None:
     clock = SystemClock()
 
     def play(emit: Emit, stop: threading.Event) -> None:
-        i = 0
+        i, braked = 0, not first
         with (folder / "sent").open("a") as sent:
             while not clock.wait(stop, 0.01):
                 now_us = clock.now_us()
-                emit("vesc", now_us, {"current_input": -20.0 if first and i == 150 else 0.0})
+                # The recorder follows the shadow once a second.
+                hard = not braked and i >= 150 and agent.recorder is not None and bool(agent.recorder.answers)
+                braked = braked or hard
+                emit("vesc", now_us, {"current_input": -20.0 if hard else 0.0})
                 emit("chatter", now_us, RosMessage(f"{now_us}".encode(), TEXT))
                 sent.write(f"{now_us}\n")
                 sent.flush()

@@ -133,6 +133,23 @@ def test_a_seek_cancels_what_is_read_and_of_several_the_last_one_counts() -> Non
     assert all(message.t_ns < 50 * SECOND for message in audience.got[:began])
 
 
+def test_a_seek_drops_what_was_about_to_be_sent() -> None:
+    class Seeks(Audience):
+        def send(self, message: Message) -> None:
+            super().send(message)
+            if (message.t_ns, message.topic) == (5 * SECOND, 0):
+                control(player, Request(play=True, seek_ns=290 * SECOND))
+
+    audience = Seeks(0, 1)
+    with Player(Ticks(300, topics=2), audience) as player:
+        control(player, Request(play=True))
+        until(audience.ended)
+    played = [(i, topic) for i in (*range(6), *range(290, 300)) for topic in (0, 1)]
+    assert [(one.t_ns // SECOND, one.topic) for one in audience.got] == [
+        one for one in played if one != (5, 1)
+    ]
+
+
 def test_another_subscription_goes_on_where_the_playhead_is_and_repeats_nothing() -> None:
     audience = Audience(0)
     with Player(Ticks(600, topics=2), audience) as player:
