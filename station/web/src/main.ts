@@ -3,7 +3,7 @@
 import { now } from "./base/clock";
 import { type Config, FIELD_TABLE, type FieldTable } from "./base/contract";
 import { byId, el, setAttribute } from "./base/dom";
-import { type Route, type RouteTo, readRoute, route, unread } from "./base/route";
+import { follow, type Route, type RouteTo, readRoute, route, unread } from "./base/route";
 import { startTheme } from "./base/theme";
 import { DrivePanel } from "./drive/panel";
 import { StopControl } from "./drive/stop_control";
@@ -124,8 +124,9 @@ class Page {
   }
 
   private go(): void {
-    this.route = readRoute(location.hash);
-    const ignored = unread(location.hash);
+    const address = follow();
+    this.route = readRoute(address);
+    const ignored = unread(address);
     this.ignored.hidden = ignored.length === 0;
     this.ignored.textContent = ignored.length > 0 ? `Ignored in the address: ${ignored.join("; ")}.` : "";
     const { view } = this.route;

@@ -372,6 +372,22 @@ def test_what_an_address_says_in_vain_is_told(open_page, any_past):
     until(lambda: not page.get_by_text("Ignored in the address").is_visible(), "a good address")
 
 
+def test_an_address_is_followed_although_the_view_before_writes_its_own(open_page, any_past):
+    """The browser tells the page of an address only after it has gone there."""
+    page = open_page(any_past + VIEWS["history"].address)
+    page.locator(VIEWS["history"].filled).first.wait_for()
+    for address, shown in {
+        "#/history/car-1?from=2026-05-04T10:00:00Z&to=2026-05-04T09:00:00Z": "from and to must be two times",
+        "#/hstory/car-1": 'there is no view "hstory/car-1"',
+    }.items():
+        page.evaluate(
+            "(hash) => { location.hash = hash; document.querySelector('.history select')"
+            ".dispatchEvent(new Event('change')); }",
+            address,
+        )
+        page.get_by_text(shown).wait_for()
+
+
 def test_the_range_that_is_shown_opens_in_foxglove(open_page, server):
     page = open_page(f"{server.url}#/history/car?{FIRST}", timezone_id="UTC")
     page.get_by_role("button", name="Open this range in Foxglove").click()

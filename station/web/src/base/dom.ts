@@ -74,6 +74,33 @@ export function choices(
   });
 }
 
+/** A list's items: what has not changed keeps its node, and with it the focus and a pressed button. */
+export class Items<T> {
+  private kept = new Map<string, HTMLElement>();
+
+  /** `item` makes an entry's node from the entry alone; no two entries are equal. */
+  constructor(
+    private readonly list: HTMLElement,
+    private readonly item: (entry: T) => HTMLElement,
+  ) {}
+
+  fill(entries: readonly T[]): void {
+    const before = this.kept;
+    this.kept = new Map(
+      entries.map((entry) => {
+        const key = JSON.stringify(entry);
+        return [key, before.get(key) ?? this.item(entry)];
+      }),
+    );
+    for (const [key, node] of before) if (!this.kept.has(key)) node.remove();
+    // A node that is moved would lose the focus.
+    [...this.kept.values()].forEach((node, i) => {
+      const there = this.list.children[i] ?? null;
+      if (there !== node) this.list.insertBefore(node, there);
+    });
+  }
+}
+
 /** A form that calls back instead of leaving the page. */
 export function form(
   attributes: Attributes,

@@ -116,12 +116,23 @@ export function unread(hash: string): string[] {
   return [...values.filter((text) => text !== ""), ...order];
 }
 
+/** The address that the page has followed or written last. */
+let followed: string | undefined;
+
+/** The browser's address, which the page follows now. */
+export function follow(): string {
+  followed = location.hash;
+  return followed;
+}
+
 /** Put what the view shows into the address, as a step of the browser's history if `step`. The view is not called. */
 export function setAddress(to: Route, step = false): void {
   const address = route(to);
-  if (address === location.hash) return;
+  // The browser is at another address already, and tells the page next: what was shown before must not replace it.
+  if (address === location.hash || location.hash !== followed) return;
   if (step) history.pushState(null, "", address);
   else history.replaceState(null, "", address);
+  follow();
 }
 
 /** Ranges in an address: car1/2026-05-04T10:00:00.000Z/2026-05-04T10:05:00.000Z,car2/… */

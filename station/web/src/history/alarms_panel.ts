@@ -1,7 +1,7 @@
 // The triggers of a robot's event recorder: alarms of one's own, and what keeps messages, beside the robot's answers.
 
 import type { Config, TriggerEntry, TriggersAnswer } from "../base/contract";
-import { button, el, panel } from "../base/dom";
+import { button, el, Items, panel } from "../base/dom";
 import { may } from "../server/admission";
 import { act, ask, Latest, words } from "../server/answers";
 
@@ -10,6 +10,7 @@ const ACCEPTED = "accepted";
 export class AlarmsPanel {
   readonly node: HTMLElement;
   private readonly list = el("ul", { class: "notes-list" });
+  private readonly items = new Items<TriggerEntry>(this.list, (trigger) => this.item(trigger));
   private readonly said = el("p", { class: "note said", role: "status" });
   private robot = "";
   private readonly loading = new Latest();
@@ -20,7 +21,7 @@ export class AlarmsPanel {
   }
 
   async show(robot: string): Promise<void> {
-    if (robot !== this.robot) this.list.replaceChildren();
+    if (robot !== this.robot) this.items.fill([]);
     this.robot = robot;
     if (!this.config.answers) return;
     await this.loading.run(
@@ -32,7 +33,7 @@ export class AlarmsPanel {
   private fill(triggers: readonly TriggerEntry[]): void {
     const adds = may(this.config, "add_trigger");
     this.node.hidden = triggers.length === 0 && !adds;
-    this.list.replaceChildren(...triggers.map((trigger) => this.item(trigger)));
+    this.items.fill(triggers);
     const none = "Press Alarm on a chart: the car tells when the value is above or below a threshold.";
     this.say("", triggers.length === 0 ? none : "");
   }

@@ -1,7 +1,7 @@
 // People's notes about a car, or the fleet: a list, and a form that writes one where the server allows it.
 
 import { type Config, MAX_NOTE_CHARACTERS, type NoteEntry, type NotesAnswer } from "../base/contract";
-import { button, el, form, panel } from "../base/dom";
+import { button, el, form, Items, panel } from "../base/dom";
 import { when } from "../base/format";
 import { inUs, type Range, writeTime } from "../base/range";
 import { route } from "../base/route";
@@ -24,6 +24,7 @@ export interface NotesOptions {
 export class NotesPanel {
   readonly node: HTMLElement;
   private readonly list = el("ul", { class: "notes-list" });
+  private readonly items = new Items<readonly [NoteEntry, number]>(this.list, (entry) => this.item(...entry));
   private readonly said = el("p", { class: "note said", role: "status" });
   private readonly text = el("input", {
     type: "text",
@@ -104,7 +105,7 @@ export class NotesPanel {
 
   private fill(newest: readonly NoteEntry[]): void {
     const notes = [...newest].reverse();
-    this.list.replaceChildren(...notes.map((note, i) => this.item(note, i + 1)).reverse());
+    this.items.fill(notes.map((note, i) => [note, i + 1] as const).reverse());
     // Without the form, an empty panel says nothing.
     this.node.hidden = notes.length === 0 && (this.robot === undefined || !may(this.config, "note"));
     this.options.shown?.(notes);
