@@ -7,7 +7,6 @@ import json
 import shutil
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from iort_station.fleet import identity, registry, robots
 from iort_station.operations import quarantine
 from iort_station.page.pubnub import Listener
 from local.deployment import ROOT
-from testkit.waiting import GUARD_S, until
+from testkit.waiting import GUARD_S, reached, until
 from tests.local.conftest import recorded
 
 EXAMPLES = ROOT / "docs" / "examples"
@@ -108,8 +107,7 @@ def test_a_small_client_stores_a_batch_and_shows_a_live_sample(language, embedde
         def shown() -> list[Any]:
             # On a slow machine its only live message may be too old to be shown.
             subprocess.run(command, check=True, timeout=GUARD_S)
-            with suppress(AssertionError):
-                until(lambda: listener.heard, within_s=5)
+            reached(lambda: listener.heard, within_s=5)
             return listener.heard
 
         live = until(shown)[0]

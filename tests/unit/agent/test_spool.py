@@ -397,7 +397,7 @@ def test_acknowledgements_and_puts_are_written_in_groups(path: Path) -> None:
     spool.on_stored(stored.set)
     spool.start()
     fill(spool, 100)
-    assert stored.wait(10)
+    assert stored.wait(60)
     spool.close()
     assert sum(commits) == 100
     assert len(commits) < 10

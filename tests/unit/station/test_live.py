@@ -232,7 +232,7 @@ def test_a_viewer_renews_its_leases_and_ends_them():
     with viewing.Viewer(cloud, ["a", "b"], rate_hz=2, broker=True, every_s=0.01) as viewer:
         assert set(cloud.heard) == {"a", "b"}, "awake at once"
         for _ in range(6):
-            assert cloud.renewed.acquire(timeout=10)
+            assert cloud.renewed.acquire(timeout=60)
     assert viewer.problem == ""
     for leases in cloud.heard.values():
         *held, ended = leases
@@ -249,7 +249,7 @@ def test_a_robot_that_comes_is_woken_and_one_that_goes_is_let_go():
     with viewing.Viewer(cloud, lambda: online, every_s=0.01):
         online[:] = ["b"]
         while not cloud.heard["b"]:
-            assert cloud.renewed.acquire(timeout=10)
+            assert cloud.renewed.acquire(timeout=60)
     assert cloud.heard["a"][-1].lease_ms == 0
 
 
@@ -266,12 +266,12 @@ def test_a_viewer_whose_network_is_gone_ends_soon(monkeypatch):
 
     viewer = viewing.Viewer(cloud, robots, every_s=0.01)
     with viewer:
-        assert asked.acquire(timeout=10)
-        assert asked.acquire(timeout=10)
+        assert asked.acquire(timeout=60)
+        assert asked.acquire(timeout=60)
         began = time.monotonic()
     assert time.monotonic() - began < 30, "it did not wait for the network"
     network.set()
-    viewer._thread.join(10)
+    viewer._thread.join(60)
 
 
 def test_who_may_not_wake_robots_is_told_and_looks_on():

@@ -268,7 +268,7 @@ def test_in_real_time_the_stop_comes_with_the_end_of_the_lease_also_if_the_first
     rig.graph.publish = failing  # type: ignore[method-assign]  # once
     rig.downlink.start()
     rig.send({"data": 2.5}, lease_ms=100)
-    assert rig.graph.stopped.wait(5)
+    assert rig.graph.stopped.wait(60)
     assert not errors
     rig.downlink.close()
     assert not rig.downlink._thread.is_alive()

@@ -85,7 +85,7 @@ class Running(Ros2Source):
         return 0.0
 
     def until_samples(self, count: int) -> None:
-        until(lambda: len(self.samples) >= count or self.error, within_s=10)
+        until(lambda: len(self.samples) >= count or self.error)
         assert self.error is None
 
     def end(self) -> None:
@@ -114,7 +114,7 @@ def start(graph: FakeGraph) -> Iterator[Any]:
 def test_a_message_is_recorded_as_it_was_published(graph: FakeGraph, start: Any) -> None:
     source = start("topics: {/t: {stream: s, time: header}}")
     publisher = graph.publisher("/t", STAMPED)
-    until(lambda: graph.subscriptions, within_s=10)
+    until(lambda: graph.subscriptions)
     t_ns = SystemClock().now_us() * 1000 + 789
     publisher.publish(stamped(t_ns, 1.5))
     source.until_samples(1)
@@ -131,7 +131,7 @@ def test_a_message_is_recorded_as_it_was_published(graph: FakeGraph, start: Any)
 def test_the_time_may_be_that_of_the_middleware(graph: FakeGraph, start: Any) -> None:
     source = start("topics: {/t: {stream: s, time: source}}")
     publisher = graph.publisher("/t", FLOAT)
-    until(lambda: graph.subscriptions, within_s=10)
+    until(lambda: graph.subscriptions)
     now_us = SystemClock().now_us()
     publisher.publish(floats(1), (now_us - 5_000_000) * 1000)
     publisher.publish(floats(2), 5_000)
@@ -146,7 +146,7 @@ def test_topics_are_found_by_patterns_and_names_go_first(graph: FakeGraph, start
     source = start(text, taken=["c"])
     names = ["/a/b/c", "/a/named", "/a/_hidden", "/c", "/account"]
     publishers = [graph.publisher(name, FLOAT) for name in names]
-    until(lambda: len(graph.subscriptions) == 4, within_s=10)
+    until(lambda: len(graph.subscriptions) == 4)
     for publisher in publishers:
         publisher.publish(floats(1))
     source.until_samples(4)
@@ -159,7 +159,7 @@ def test_a_remapped_topic_is_not_found_again_by_a_pattern(graph: FakeGraph, star
     graph.remapped["/t"] = "/robot/t"
     source = start("topics: {/t: {stream: s, time: arrival}, '/robot/*': {time: arrival}}")
     publisher = graph.publisher("/robot/t", FLOAT)
-    until(lambda: source.report().get("/t", {}).get("qos"), within_s=10)
+    until(lambda: source.report().get("/t", {}).get("qos"))
     publisher.publish(floats(1))
     source.until_samples(1)
     assert [one[0] for one in source.samples] == ["s"]
@@ -174,7 +174,7 @@ def test_latched_messages_are_stored_once_over_runs(graph: FakeGraph, start: Any
     first.until_samples(1)
     first.end()
     second = start(text, queue=queue)
-    until(lambda: second.report().get("/map", {}).get("latched_again") == 1, within_s=10)
+    until(lambda: second.report().get("/map", {}).get("latched_again") == 1)
     # The same content published anew is a new message.
     publisher.publish(floats(1))
     second.until_samples(1)
@@ -187,7 +187,7 @@ def test_latched_messages_are_stored_once_over_runs(graph: FakeGraph, start: Any
 def test_a_type_that_is_not_installed_is_what_the_source_waits_for(graph: FakeGraph, start: Any) -> None:
     source = start("topics: {/t: {stream: s, time: arrival}}")
     graph.publisher("/t", "b_msgs/msg/Lost")
-    until(lambda: source.report().get("waits"), within_s=10)
+    until(lambda: source.report().get("waits"))
     assert source.report() == {
         "/t": {"messages": 0, "silent": False, "left_out": {}, "type_not_installed": 1},
         "waits": "topic /t: the ROS type b_msgs/msg/Lost is not installed",
@@ -197,7 +197,7 @@ def test_a_type_that_is_not_installed_is_what_the_source_waits_for(graph: FakeGr
 def test_malformed_bytes_harm_nothing_else(graph: FakeGraph, start: Any) -> None:
     source = start("topics: {/t: {stream: s, time: header, fields: [x]}}")
     publisher = graph.publisher("/t", STAMPED)
-    until(lambda: graph.subscriptions, within_s=10)
+    until(lambda: graph.subscriptions)
     now_ns = SystemClock().now_us() * 1000
     bad = [b"", b"\0\1\0\0", b"\0\x63\0\0" + stamped(now_ns, 1)[4:], stamped(now_ns, 1)[:-3]]
     for data in [*bad, stamped(now_ns, 2)]:
@@ -210,10 +210,10 @@ def test_malformed_bytes_harm_nothing_else(graph: FakeGraph, start: Any) -> None
 def test_a_definition_that_differs_is_not_looked_into(graph: FakeGraph, start: Any) -> None:
     source = start("topics: {/t: {stream: s, time: arrival}}")
     source_types = FakeTypes(TEXTS, {FLOAT: "RIHS01_1"})
-    until(lambda: source._node, within_s=10)
+    until(lambda: source._node)
     source._node._types.hashes = source_types.hashes
     publisher = graph.publisher("/t", FLOAT, RELIABLE, type_hash="RIHS01_2")
-    until(lambda: graph.subscriptions, within_s=10)
+    until(lambda: graph.subscriptions)
     publisher.publish(floats(1))
     source.until_samples(1)
     ((_, _, values),) = source.samples
@@ -226,7 +226,7 @@ def test_a_node_that_ends_ends_the_source(graph: FakeGraph, start: Any) -> None:
     WATCH.on_end(lambda: None)
     graph.fails = RuntimeError("the context is gone")
     source = start("topics: {/t: {stream: s, time: arrival}}")
-    until(lambda: source.error, within_s=10)
+    until(lambda: source.error)
     assert str(source.error) == "the ROS node /iort_agent has ended: RuntimeError: the context is gone"
 
 
