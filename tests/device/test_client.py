@@ -19,6 +19,7 @@ def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
     """Return whether a callback in the thread of AWS' client finds what an earlier one stored."""
     left = threading.local()
     found: queue.SimpleQueue[bool] = queue.SimpleQueue()
+    stopped = threading.Event()
 
     def on_refused(_: Any) -> None:
         known = hasattr(left, "mark")
@@ -39,6 +40,7 @@ def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
                 min_reconnect_delay_ms=1,
                 max_reconnect_delay_ms=1,
                 on_lifecycle_event_connection_failure_fn=on_refused,
+                on_lifecycle_event_stopped_fn=lambda _: stopped.set(),
             )
         )
         client.start()
@@ -47,6 +49,7 @@ def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
             return found.get(timeout=60)
         finally:
             client.stop()
+            assert stopped.wait(60), "its thread would call back in later tests"
 
 
 @pytest.mark.parametrize(("at_the_first", "kept"), [(keep_state, True), (lambda: None, False)])

@@ -214,6 +214,7 @@ def test_a_recording_is_done_when_it_is_delivered_however_long_that_takes(
     assert rig.runtime.run(drain_s=None) == 0
     assert rig.recorded() == list(range(500))
     assert "502 samples in 12 batches are still to be delivered; not connected: no answer" in caplog.text
+    rig.spool.close()
 
 
 def test_what_a_recording_leaves_is_flushed_and_not_played_again(
