@@ -10,7 +10,7 @@ from iort_contract.topics import PING_PATHS
 
 RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM = "rtt", "agent", "types", "account"
 LOG_STREAM, POSE_STREAM, DRIVE_STREAM = "log", "pose", "drive"
-INCIDENT_STREAM = "incidents"
+INCIDENT_STREAM, VIDEO_STREAM = "incidents", "video"
 # One sample per pong, with null in the other paths' fields.
 RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
 
@@ -93,6 +93,30 @@ CATALOG = {
                     "motion",
                     label="Steering asked for",
                 ),
+                Field(
+                    "frame", "", "the newest picture on the driver's screen; null if the command names none"
+                ),
+                Field(
+                    "frame_age_ms",
+                    "ms",
+                    "age of that picture when the command came; null if the robot does not know the picture",
+                    label="Picture's age",
+                ),
+                Field("blind", "", "whether the driver said that he drives without a picture"),
+            ),
+            own=True,
+        ),
+        Stream(
+            VIDEO_STREAM,
+            "the pictures that were shown to somebody, at their capture times; recorded",
+            (
+                Field("frame", "", "the picture's number in this run of the agent", label="Picture"),
+                Field("bytes", "bytes", "size of the encoded picture; the JPEG's if nobody had WebRTC"),
+                Field("key", "", "whether the picture needs no other one"),
+                Field("encode_ms", "ms", "from the capture to the encoded picture", label="Encoding"),
+                Field("bitrate_kbps", "kbit/s", "the bitrate that the encoder aimed at", label="Bitrate"),
+                Field("viewers", "viewers", "viewers by WebRTC"),
+                Field("watchers", "viewers", "viewers of pictures over the broker"),
             ),
             own=True,
         ),

@@ -23,6 +23,8 @@ from iort_contract.topics import check_stream
 # Upper limits, whatever an operator asks for: a command expires, and a motion must end.
 MAX_VALID_MS, MAX_LEASE_MS = 60_000, 10_000
 MAX_BY_CHARACTERS = 64
+# The numbers of pictures have 32 bits.
+MAX_FRAME = 2**32 - 1
 # Other robots act on fleet messages, so they expire sooner than live samples for people (LIVE_MAX_AGE_MS).
 FLEET_MAX_AGE_MS = 2_000
 
@@ -36,10 +38,11 @@ class Command:
     stale ``valid_ms`` after ``sent_us``, by the cloud's clock. ``lease_ms`` limits a motion, also from
     ``sent_us``; a motion without it is refused. While the lease of one session holds, motions of another are
     refused, unless it is later and says ``takeover``. A session that was refused so stays refused. A motion
-    that ``ends`` its lease stops the robot at once, and lets others drive.
-    ``message`` is the ROS message. With ``answer`` the robot reports the result in its shadow: `COMMANDS`,
-    name, ``session``, ``seq`` and ``outcome``, which is `ACCEPTED` or the reason.
-    """
+    that ``ends`` its lease stops the robot at once, and lets others drive. ``frame`` is the number of the
+    newest picture on the driver's screen. A robot with video refuses a motion that names none, or an old
+    one, unless its driver says that he drives ``blind``; one that ``ends`` needs neither. ``message`` is the
+    ROS message. With ``answer`` the robot reports the result in its shadow: `COMMANDS`, name, ``session``,
+    ``seq`` and ``outcome``, which is `ACCEPTED` or the reason."""
 
     session: str
     started_us: int
@@ -52,6 +55,8 @@ class Command:
     by: str | None = None
     takeover: bool = False
     ends: bool = False
+    frame: int | None = None
+    blind: bool = False
 
     @property
     def order(self) -> tuple[int, str, int]:
@@ -96,6 +101,8 @@ def _check_command(command: Command) -> None:
     whole_number("valid_ms", command.valid_ms, 1, MAX_VALID_MS)
     if command.lease_ms is not None:
         whole_number("lease_ms", command.lease_ms, 1, MAX_LEASE_MS)
+    if command.frame is not None:
+        whole_number("frame", command.frame, 1, MAX_FRAME)
 
 
 encode_command, decode_command = codec(Command, "command", _check_command)
@@ -137,6 +144,8 @@ DRIVEN_BY_ANOTHER, EMERGENCY_STOP, BEGIN_AGAIN, SETTINGS_UNKNOWN, NO_GUARD = (
     "settings_unknown",
     "guard_not_ready",
 )
+# Of a robot with video: the command names no picture, or one that is older than the robot allows.
+NO_PICTURE, PICTURE_LATE = "no_picture", "picture_late"
 # The type of a car that a stick drives, as the simulated one, in ROS 1 and in ROS 2.
 DRIVE_TYPE = "ackermann_msgs/AckermannDriveStamped"
 ROS2_DRIVE_TYPE = "ackermann_msgs/msg/AckermannDriveStamped"
@@ -166,6 +175,8 @@ REFUSALS: Mapping[str, str] = {
     NO_LEASE: "a motion needs `lease_ms`",
     NO_GUARD: "the process that stops the robot if the agent dies is not running yet",
     NO_ROS: "the agent is not in the ROS graph",
+    NO_PICTURE: "the command names no picture: drive on the page by its picture, or say that you drive blind",
+    PICTURE_LATE: "the driver's picture was too old when the command came",
     CLOSED: "the agent is ending",
 }
 # What ends a driver's session for good. After any other refusal the car is told on to stand.

@@ -18,6 +18,7 @@ from iort_contract.messages.recorder import (
     decode_wanted,
     encode_answers,
 )
+from iort_contract.messages.video import VideoTerms, decode_terms, encode_terms
 from iort_contract.tables import AGENT_VERSION, OVER_SHARE
 from iort_contract.topics import COMMANDS, check_stream
 
@@ -111,7 +112,7 @@ def check_setting(name: str, value: Any) -> None:
         raise ContractError(f"{name} must be {SETTINGS[name].allowed}, got {shown(value)}")
 
 
-REJECTED, DRIVE, MOVES, STOPS = "rejected", "drive", "moves", "stops"
+REJECTED, DRIVE, MOVES, STOPS, VIDEO = "rejected", "drive", "moves", "stops", "video"
 # Larger than any count, and than any time of a calendar.
 _MOST = 10**15
 _SECTIONS = (*dict.fromkeys(name.split(".")[0] for name in SETTINGS if "." in name), FIELDS)
@@ -182,7 +183,8 @@ class Desired:
 class Reported:
     """The settings in force and the rejected ones, by name; the newest outcome of each command; what a stick
     drives, if the robot can be driven by hand. ``moves`` tells whether it has a motion that a stop ends; None
-    of an agent that does not say so. ``recorder`` has the answer to each trigger: accepted, or why not."""
+    of an agent that does not say so. ``recorder`` has the answer to each trigger: accepted, or why not.
+    ``video`` is what the robot's camera can show; None without one."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     rejected: Mapping[str, Rejection] = field(default_factory=dict)
@@ -191,6 +193,7 @@ class Reported:
     drive: DriveLimits | None = None
     moves: bool | None = None
     recorder: Mapping[str, str] = field(default_factory=dict)
+    video: VideoTerms | None = None
 
 
 def decode_desired(document: Any) -> Desired:
@@ -232,6 +235,7 @@ def decode_reported(document: Any) -> Reported:
     drive = decode_limits(sections.pop(DRIVE, None))
     moves = sections.pop(MOVES, None)
     recorder = decode_answers(sections.pop(RECORDER, None))
+    video = decode_terms(sections.pop(VIDEO, None))
     return Reported(
         dict(sorted(_flat(sections))),
         _each_valid(Rejection, dict(sorted(rejected.items()))),
@@ -240,6 +244,7 @@ def decode_reported(document: Any) -> Reported:
         drive,
         moves if isinstance(moves, bool) else None,
         recorder,
+        video,
     )
 
 
@@ -254,6 +259,7 @@ def encode_reported(reported: Reported) -> dict[str, Any]:
         DRIVE: encode_limits(reported.drive),
         MOVES: reported.moves,
         RECORDER: encode_answers(reported.recorder),
+        VIDEO: encode_terms(reported.video),
     }
 
 

@@ -51,6 +51,8 @@ export const REFUSALS = {
   "without_lease": "a motion needs `lease_ms`",
   "guard_not_ready": "the process that stops the robot if the agent dies is not running yet",
   "no_ros": "the agent is not in the ROS graph",
+  "no_picture": "the command names no picture: drive on the page by its picture, or say that you drive blind",
+  "picture_late": "the driver's picture was too old when the command came",
   "shutting_down": "the agent is ending"
 } as const;
 export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
@@ -117,6 +119,13 @@ export const FIELD_TABLE: FieldTable = {
     "files_waiting": { "unit": "files", "meaning": "files waiting to be uploaded" },
     "files_sent_bytes": { "unit": "bytes", "meaning": "bytes of files sent", "label": "Files sent" },
     "thread_errors": { "unit": "errors", "meaning": "errors of the agent's threads, since the sample before" },
+    "frame": { "unit": "", "meaning": "the picture's number in this run of the agent", "label": "Picture" },
+    "bytes": { "unit": "bytes", "meaning": "size of the encoded picture; the JPEG's if nobody had WebRTC" },
+    "key": { "unit": "", "meaning": "whether the picture needs no other one" },
+    "encode_ms": { "unit": "ms", "meaning": "from the capture to the encoded picture", "label": "Encoding" },
+    "bitrate_kbps": { "unit": "kbit/s", "meaning": "the bitrate that the encoder aimed at", "label": "Bitrate" },
+    "viewers": { "unit": "viewers", "meaning": "viewers by WebRTC" },
+    "watchers": { "unit": "viewers", "meaning": "viewers of pictures over the broker" },
     "speed_mps": { "unit": "m/s", "meaning": "speed of the car", "label": "Speed" },
     "power_w": { "unit": "W", "meaning": "electrical power from the battery, negative while regenerating", "label": "Battery power" }
   },
@@ -142,7 +151,10 @@ export const FIELD_TABLE: FieldTable = {
       "driver_by": { "unit": "", "meaning": "who drives now" },
       "lease_left_ms": { "unit": "ms", "meaning": "how long the driver's lease still holds", "label": "Lease left" },
       "speed": { "unit": "m/s", "meaning": "the speed that the robot was told; null if refused", "label": "Speed asked for" },
-      "steering": { "unit": "rad", "meaning": "the steering angle that it was told", "label": "Steering asked for" }
+      "steering": { "unit": "rad", "meaning": "the steering angle that it was told", "label": "Steering asked for" },
+      "frame": { "unit": "", "meaning": "the newest picture on the driver's screen; null if the command names none" },
+      "frame_age_ms": { "unit": "ms", "meaning": "age of that picture when the command came; null if the robot does not know the picture", "label": "Picture's age" },
+      "blind": { "unit": "", "meaning": "whether the driver said that he drives without a picture" }
     },
     "incidents": {
       "id": { "unit": "", "meaning": "the incident, in hexadecimal" },
