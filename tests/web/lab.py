@@ -315,6 +315,7 @@ class Lab:
             "by": "operator@lab" if told else "",
             "at_ms": round(NOW_S * 1000) if told else 0,
             "drive": LIMITS if name == "car-1" else None,
+            "video": None,
         }
 
     def drive(self, _asked):

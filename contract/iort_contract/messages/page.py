@@ -258,6 +258,16 @@ class DriveLimitsEntry(TypedDict):
     lease_ms: int
 
 
+class VideoTermsEntry(TypedDict):
+    """What a robot's camera can show: `iort_contract.messages.video.VideoTerms`. It takes no motion by a
+    picture that is older than ``max_age_ms``."""
+
+    width: int
+    height: int
+    rate_hz: float
+    max_age_ms: int
+
+
 class MotionEntry(TypedDict):
     """Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere,
     unless the robot rejected it; ``stopped`` as the robot has confirmed it, null before it does. ``reason``
@@ -266,7 +276,7 @@ class MotionEntry(TypedDict):
     it can be stopped from here, null before it has said so. ``why_not`` is for a human, empty if it is
     stoppable. ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop,
     or else released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot
-    drive it."""
+    drive it, ``video`` if it has no camera to drive it by."""
 
     asked: bool
     stopped: bool | None
@@ -278,6 +288,7 @@ class MotionEntry(TypedDict):
     by: str
     at_ms: int
     drive: DriveLimitsEntry | None
+    video: VideoTermsEntry | None
 
 
 class MotionAnswer(TypedDict):

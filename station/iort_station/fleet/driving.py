@@ -11,6 +11,10 @@ it.
                          |                              |                     |
                          +--- something is against it --+--> over             +-- leave, lost --> free
 
+A robot with video is driven by sight: each command names the newest picture on the driver's screen. Without
+one, or with one that is older than the robot allows, nothing is sent but the end of the lease, also by a
+driver who has let go: the car is lost as by a lease that ended. A driver may say to drive blind.
+
 The page does the same in station/web/src/drive/driver.ts; tests/unit/station/fleet/driving.json tests both.
 
 Times are microseconds of this computer's monotonic clock. The cloud's time is learned from the car's
@@ -89,7 +93,8 @@ def _bounds(
 
 class Driver:
     """One driver at one stick. ``top_mps`` is the driver's own top speed, within the car's limit;
-    ``new_name`` names each session."""
+    ``new_name`` names each session. ``picture_us`` is how old a picture may be; None for a robot without
+    video. A driver of one with video sees its pictures (`see`), or is ``blind``."""
 
     def __init__(
         self,
@@ -97,6 +102,9 @@ class Driver:
         by: str,
         top_mps: float,
         new_name: Callable[[], str] = lambda: secrets.token_hex(8),
+        *,
+        picture_us: int | None = None,
+        blind: bool = False,
     ) -> None:
         self.limits, self.top_mps = limits, top_mps
         self.phase, self.reason, self.stick = Phase.FREE, "", Stick()
@@ -106,7 +114,12 @@ class Driver:
         self.mine = False
         self.takeover = False
         self.by = by
+        self.blind = blind
         self._new_name = new_name
+        self._picture_us = picture_us
+        # The newest picture on the screen, and when it was taken, by this clock.
+        self._frame: int | None = None
+        self._captured_us = 0
         # Whether the car is told to stand while nobody holds the stick.
         self._standing = False
         self._clock = CloudClock()
@@ -126,6 +139,10 @@ class Driver:
         if offset_us is None or self._taken_us is None:
             return None
         return max(0, now_us + offset_us - self._taken_us)
+
+    def see(self, frame: int | None, age_us: int, now_us: int) -> None:
+        """Take the newest picture on the screen, and its age; None once no picture is shown."""
+        self._frame, self._captured_us = frame, now_us - age_us
 
     def hold(self, *, held: bool, now_us: int) -> None:
         """The driver holds the stick, or lets go."""
@@ -170,6 +187,9 @@ class Driver:
         self._ticked_us = now_us
         if now_us > self._driver_until_us:
             self.driver, self.mine = "", False
+        unseen = self._unseen(now_us)
+        if unseen and (self._standing or self.phase in (Phase.STARTING, Phase.DRIVING)):
+            self._end(unseen, lost=True)
         if self.phase in (Phase.STARTING, Phase.DRIVING):
             # The keys of that time may have been let go since.
             lease_us = _lease_ms(self.limits) * 1000
@@ -215,6 +235,17 @@ class Driver:
             return "nothing has been heard of the car yet"
         if age_us > commands.DRIVE_MAX_AGE_MS * 1000:
             return f"the newest sample is {age_us // 1000} ms old, {commands.DRIVE_MAX_AGE_MS} ms are allowed"
+        return self._unseen(now_us)
+
+    def _unseen(self, now_us: int) -> str:
+        """Why the car must not be driven by its picture; empty if it may, has none, or is driven blind."""
+        if self._picture_us is None or self.blind:
+            return ""
+        if self._frame is None:
+            return "there is no picture"
+        age_us = now_us - self._captured_us
+        if age_us > self._picture_us:
+            return f"the picture is {age_us // 1000} ms old, {self._picture_us // 1000} ms are allowed"
         return ""
 
     def _unanswered(self, now_us: int) -> str:
@@ -292,6 +323,8 @@ class Driver:
             by=self.by,
             takeover=self.takeover,
             ends=ends,
+            frame=None if self._picture_us is None else self._frame,
+            blind=self.blind and self._picture_us is not None,
         )
 
     def _cloud_us(self, now_us: int) -> int:

@@ -13,6 +13,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.messages import shadow
 from iort_contract.messages.commands import NO_MOTION, DriveLimits
+from iort_contract.messages.video import VideoTerms
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
@@ -29,7 +30,7 @@ class Motion(NamedTuple):
     does), and why the robot rejected a stop or a release. A rejected stop is not asked for: it holds nothing.
     ``drive`` is None if a stick cannot drive it. ``stoppable`` tells whether a stop ends its motion; None
     before the robot has said so. ``alone`` is a stop that the release of the fleet does not end. ``by`` is
-    who stopped it, or else released it last."""
+    who stopped it, or else released it last. ``video`` is what its camera shows; None without one."""
 
     asked: bool
     stopped: bool | None
@@ -38,6 +39,7 @@ class Motion(NamedTuple):
     stoppable: bool | None = None
     alone: bool = False
     by: shadow.Pressed | None = None
+    video: VideoTerms | None = None
 
     @property
     def stands(self) -> bool:
@@ -168,6 +170,7 @@ def _motion(cloud: Cloud, robot: str) -> Motion:
         stoppable=state.reported.moves,
         alone=asked and state.desired.stopped_alone,
         by=notes.newest if asked else notes.released,
+        video=state.reported.video,
     )
 
 

@@ -184,6 +184,7 @@ def _entry(motion: stopping.Motion) -> MotionEntry:
         "by": motion.by.by if motion.by is not None else "",
         "at_ms": motion.by.t_ms if motion.by is not None else 0,
         "drive": None if motion.drive is None else {**asdict(motion.drive)},  # type: ignore[typeddict-item]  # its fields
+        "video": None if motion.video is None else {**asdict(motion.video)},  # type: ignore[typeddict-item]  # its fields
     }
 
 

@@ -33,6 +33,10 @@ interface Change {
   takeover?: boolean;
   block?: string;
   stick?: Stick;
+  see?: number | null;
+  shown?: false;
+  blind?: boolean;
+  hidden?: boolean;
   link?: Partial<Link>;
 }
 type Step = readonly [times: number, change?: Change];
@@ -45,6 +49,10 @@ interface Sent {
   readonly sent_us: number;
   readonly takeover?: boolean;
   readonly ends?: boolean;
+  readonly frame?: number;
+  readonly blind?: boolean;
+  /** How many pictures the one that it names is older than the newest that was shown. */
+  readonly behind: number | null;
   readonly message: { readonly drive: { readonly speed: number; readonly steering_angle: number } };
 }
 interface Drive {
@@ -65,23 +73,29 @@ after(() => {
 });
 
 /** A car 40 ms away in each direction. A turn lets 50 ms pass: the car hears what was sent, and answers at 10 Hz with
- *  the outcome that is set. `driven` in tests/unit/station/fleet/test_driving.py is the same for the terminal. */
-function drive(steps: readonly Step[], limits = LIMITS): Drive {
-  let [now, names, due] = [1e6, 0, 0];
+ *  the outcome that is set. While `see` is a number, each time a picture of that age comes on the screen. `driven` in tests/unit/station/fleet/test_driving.py is the same for the terminal. */
+function drive(steps: readonly Step[], limits = LIMITS, picture_ms?: number): Drive {
+  let [now, names, due, shown] = [1e6, 0, 0, 0];
+  let see: number | null = null;
   const link: Link = { way: 40, outcome: "accepted", driver: undefined, by: "", silent: false, deaf: false };
-  const driver = new Driver(limits, "ada", () => `0000000${(names += 1)}`);
+  const driver = new Driver(limits, "ada", () => `0000000${(names += 1)}`, picture_ms);
   driver.top_mps = 1;
   const sent: Sent[] = [];
   const arriving: { readonly at: number; readonly command: Sent }[] = [];
+  const look = (): void => {
+    if (see !== null) driver.see((shown += 1), see, now);
+  };
   const turn = (): void => {
     const command = driver.tick(now);
     if (command) {
       wire.commands.push(command);
-      const left = { ...command, at: now } as unknown as Sent;
+      const behind = command.frame === undefined ? null : shown - command.frame;
+      const left = { ...command, at: now, behind } as unknown as Sent;
       sent.push(left);
       if (!link.deaf) arriving.push({ at: now + 2 * link.way, command: left });
     }
     now += TICK_MS;
+    look();
     const heard = arriving.filter(({ at }) => at <= now);
     arriving.splice(0, heard.length);
     if (link.silent || now < due) return;
@@ -98,6 +112,11 @@ function drive(steps: readonly Step[], limits = LIMITS): Drive {
     driver.hear(message as unknown as LiveMessage, now);
   };
   for (const [times, change = {}] of steps) {
+    if (change.see !== undefined) see = change.see;
+    look();
+    if (change.shown === false) driver.see(undefined, undefined, now);
+    driver.blind = change.blind ?? driver.blind;
+    if (change.hidden !== undefined) driver.hide(change.hidden);
     if (change.hold !== undefined) driver.hold(change.hold, now);
     now += change.pause ?? 0;
     if (change.leave) driver.leave();
@@ -116,13 +135,17 @@ const PUSHED: Change = { hold: true, stick: { x: -1, y: 1 } };
 const HELD: readonly Step[] = [[4], [20, PUSHED]];
 
 describe("the vectors that the terminal's driver has, too", () => {
-  for (const { name, steps, expected } of driving.vectors)
+  for (const { name, steps, expected, ...given } of driving.vectors)
     test(name, () => {
-      const outcome = drive(steps as unknown as Step[]);
+      const picture_ms = "picture_ms" in given ? given.picture_ms : undefined;
+      const outcome = drive(steps as unknown as Step[], LIMITS, picture_ms);
       const commands: unknown[][] = [];
-      for (const { session, message, lease_ms, ...command } of outcome.sent) {
+      for (const { session, message, lease_ms, behind, ...command } of outcome.sent) {
         const { speed, steering_angle } = message.drive;
-        const kind = [session, speed, steering_angle, lease_ms, "takeover" in command, "ends" in command];
+        const kind: unknown[] = [session, speed, steering_angle, lease_ms];
+        kind.push("takeover" in command, "ends" in command);
+        if (picture_ms === undefined) assert.ok(!("frame" in command || "blind" in command));
+        else kind.push(behind, "blind" in command);
         const last = commands.at(-1);
         if (last && JSON.stringify(last.slice(1)) === JSON.stringify(kind)) last[0] = Number(last[0]) + 1;
         else commands.push([1, ...kind]);
@@ -258,6 +281,29 @@ describe("a hold", () => {
     assert.equal(over.reason, "The car does not answer");
     assert.deepEqual(new Set(over.speeds), new Set([0]));
   });
+
+  for (const [change, reason] of [
+    [{ see: null }, "The picture is 520 ms old, at most 500 ms is allowed"],
+    [{ hidden: true }, "This tab is hidden: nobody sees the picture"],
+    [{ see: null, shown: false }, "There is no picture"],
+  ] as const)
+    for (const let_go of [[], [10, { hold: false }]] as const)
+      test(`by sight gives the car up at once: ${reason}, ${let_go.length === 0 ? "driving" : "held"}`, () => {
+        const before = [[4, { see: 120 }], [20, PUSHED], ...(let_go.length === 0 ? [] : [let_go])] as Step[];
+        const lost = drive([...before, [30, change]], LIMITS, 500);
+        assert.deepEqual([lost.phase, lost.reason], [let_go.length === 0 ? "over" : "free", reason]);
+        assert.deepEqual(
+          lost.sent.slice(-4).map(({ ends }) => ends),
+          [undefined, true, true, true],
+        );
+        // The picture is back, and the stick as it was: nothing is sent.
+        const back = drive([...before, [30, change], [40, { see: 120, hidden: false }]], LIMITS, 500);
+        assert.equal(back.sent.length, lost.sent.length);
+        // Whoever drives blind, or a car without video, does not need it.
+        const blind = drive([...before, [30, { ...change, blind: true }]], LIMITS, 500);
+        for (const { phase } of [blind, drive([...before, [30, change]])])
+          assert.equal(phase, let_go.length === 0 ? "driving" : "holding");
+      });
 
   test("may be taken over when asked", () => {
     const refused: Step = [

@@ -593,7 +593,15 @@ export interface DriveLimitsEntry {
   readonly lease_ms: number;
 }
 
-/** Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere, unless the robot rejected it; ``stopped`` as the robot has confirmed it, null before it does. ``reason`` says why it rejected a stop or a release. ``stands``: by the robot's own word it takes no motion by command until it is released. ``stoppable``: whether a stop ends its motion; false if nothing that moves it can be stopped from here, null before it has said so. ``why_not`` is for a human, empty if it is stoppable. ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop, or else released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot drive it. */
+/** What a robot's camera can show: `iort_contract.messages.video.VideoTerms`. It takes no motion by a picture that is older than ``max_age_ms``. */
+export interface VideoTermsEntry {
+  readonly width: number;
+  readonly height: number;
+  readonly rate_hz: number;
+  readonly max_age_ms: number;
+}
+
+/** Whether a robot may move. ``asked`` is the emergency stop as it was last asked for here or elsewhere, unless the robot rejected it; ``stopped`` as the robot has confirmed it, null before it does. ``reason`` says why it rejected a stop or a release. ``stands``: by the robot's own word it takes no motion by command until it is released. ``stoppable``: whether a stop ends its motion; false if nothing that moves it can be stopped from here, null before it has said so. ``why_not`` is for a human, empty if it is stoppable. ``alone``: the release of the fleet does not end this stop. ``by`` is who asked for the stop, or else released the robot last, at ``at_ms``; empty if unknown. ``drive`` is null if a stick cannot drive it, ``video`` if it has no camera to drive it by. */
 export interface MotionEntry {
   readonly asked: boolean;
   readonly stopped: boolean | null;
@@ -605,6 +613,7 @@ export interface MotionEntry {
   readonly by: string;
   readonly at_ms: number;
   readonly drive: DriveLimitsEntry | null;
+  readonly video: VideoTermsEntry | null;
 }
 
 /** Answers ``motion`` and ``stop``: each robot's. ``user`` is who drives if the viewer gives no name. ``failed`` has the reason for each robot whose stop could not be changed. */

@@ -16,6 +16,9 @@ export interface Command {
   readonly takeover?: true;
   /** It ends the lease at once, so that others may drive. */
   readonly ends?: true;
+  /** The number of the newest picture on the screen. */
+  readonly frame?: number;
+  readonly blind?: true;
 }
 
 /** One hold of the stick. */
@@ -43,12 +46,16 @@ export function commandOf(
     motion,
     takeover,
     ends,
+    frame,
+    blind,
   }: {
     readonly seq: number;
     readonly sent_us: number;
     readonly motion: Motion;
     readonly takeover: boolean;
     readonly ends: boolean;
+    readonly frame: number | undefined;
+    readonly blind: boolean;
   },
 ): Command {
   const lease_ms = Math.max(1, leaseOf(limits) - DRIVE_MARGIN_MS);
@@ -65,6 +72,8 @@ export function commandOf(
     by: session.by,
     ...(takeover ? { takeover } : {}),
     ...(ends ? { ends } : {}),
+    ...(frame === undefined ? {} : { frame }),
+    ...(blind ? { blind } : {}),
   };
 }
 

@@ -5,6 +5,14 @@
 // move because an obstacle to driving has gone away. Who has let go still has the wheel: the car is told to stand, so
 // that no planner on board drives off, until the viewer leaves the wheel or loses it.
 //
+// A car with video is driven by sight: `new Driver(limits, by, newName, motion.video?.max_age_ms)`. Call
+//   see(frame, age_ms, now_ms)  at each new picture on the screen: its number and its age at now_ms; both undefined once
+//                               no picture is shown. The age grows by itself until the next call.
+//   hide(hidden)                at each visibilitychange, and once at first.
+//   blind = true                while the viewer says that he drives blind.
+// Each command names the newest picture. Without one, with a late one or in a hidden tab nothing is sent but the end of
+// the lease, also by who has let go: the car is lost as by a lease that ended. `unseen(now_ms)` says why.
+//
 // iort_station.fleet.driving does the same and draws the phases; tests/unit/station/fleet/driving.json tests both.
 
 import {
@@ -39,6 +47,10 @@ export class Driver {
   /** The viewer's own top speed. */
   top_mps: number;
   stick: Stick = CENTRE;
+  /** Whether the viewer says that he drives a car with video without its picture. */
+  blind = false;
+  private picture: { readonly frame: number; readonly taken_ms: number } | undefined;
+  private hidden = false;
   private readonly clock = new CloudClock();
   private held = false;
   /** Whether the car is told to stand while nobody holds the stick. */
@@ -62,6 +74,8 @@ export class Driver {
     private readonly limits: DriveLimitsEntry,
     private readonly by: string,
     private readonly newName: () => string,
+    /** How old a picture may be; undefined for a car without video. */
+    private readonly maxPicture_ms?: number,
   ) {
     this.top_mps = limits.max_speed_mps;
   }
@@ -72,6 +86,22 @@ export class Driver {
     return cloud === undefined || this.taken_ms === -Infinity
       ? undefined
       : Math.max(0, cloud - this.taken_ms);
+  }
+
+  /** The newest picture on the screen, and its age when it got there; undefined once no picture is shown. */
+  see(frame: number | undefined, age_ms: number | undefined, now_ms: number): void {
+    this.picture =
+      frame === undefined || age_ms === undefined ? undefined : { frame, taken_ms: now_ms - age_ms };
+  }
+
+  /** Whether the tab is hidden. */
+  hide(hidden: boolean): void {
+    this.hidden = hidden;
+  }
+
+  /** The age of the newest picture on the screen; undefined without one. */
+  picture_ms(now_ms: number): number | undefined {
+    return this.picture && Math.max(0, now_ms - this.picture.taken_ms);
   }
 
   /** Who drives now, by the car's own word: the name, and whether it is this hold. */
@@ -135,6 +165,9 @@ export class Driver {
   tick(now_ms: number): Command | undefined {
     const still_ms = now_ms - this.ticked_ms;
     this.ticked_ms = now_ms;
+    const unseen = this.unseen(now_ms);
+    if (unseen !== "" && (this.standing || this.phase === "starting" || this.phase === "driving"))
+      this.end(unseen, true);
     if (this.phase === "starting" || this.phase === "driving") {
       // A key may have been let go meanwhile.
       const frozen =
@@ -181,6 +214,17 @@ export class Driver {
     if (age === undefined) return "Nothing has been heard of the car yet";
     return age > DRIVE_MAX_AGE_MS
       ? `The newest sample is ${Math.round(age)} ms old, at most ${DRIVE_MAX_AGE_MS} ms is allowed`
+      : this.unseen(now_ms);
+  }
+
+  /** Why the car must not be driven by its picture; an empty text if it may, has none, or is driven blind. */
+  unseen(now_ms: number): string {
+    if (this.maxPicture_ms === undefined || this.blind) return "";
+    if (this.hidden) return "This tab is hidden: nobody sees the picture";
+    const age = this.picture_ms(now_ms);
+    if (age === undefined) return "There is no picture";
+    return age > this.maxPicture_ms
+      ? `The picture is ${Math.round(age)} ms old, at most ${this.maxPicture_ms} ms is allowed`
       : "";
   }
 
@@ -252,7 +296,15 @@ export class Driver {
       motion,
       takeover: this.takeover,
       ends,
+      ...this.sight(),
     });
+  }
+
+  /** What a command says of the picture; nothing to a car without video. */
+  private sight(): { readonly frame: number | undefined; readonly blind: boolean } {
+    return this.maxPicture_ms === undefined
+      ? { frame: undefined, blind: false }
+      : { frame: this.picture?.frame, blind: this.blind };
   }
 
   private cloud_ms(now_ms: number): number | undefined {

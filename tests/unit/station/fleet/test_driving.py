@@ -33,15 +33,30 @@ VECTORS = json.loads(Path(__file__).with_name("driving.json").read_text())
 LINK = {"way": 40, "outcome": "accepted", "driver": None, "by": "", "silent": False, "deaf": False}
 
 
-def driven(limits: Mapping[str, Any], steps: list[Any]) -> dict[str, Any]:
+def driven(limits: Mapping[str, Any], steps: list[Any], picture_ms: int | None = None) -> dict[str, Any]:
     """What a driver has done after the steps; a step is how often 50 ms pass, and what changes before. The
-    car is ``way`` ms away in each direction, answers at 10 Hz, and its clock is 3 s ahead. `CAR` in
-    station/web/test/drive.test.ts is the same for the page's driver."""
+    car is ``way`` ms away in each direction, answers at 10 Hz, and its clock is 3 s ahead. While ``see`` is a
+    number, each time a picture of that age comes on the screen. `drive` in station/web/test/drive.test.ts is
+    the same for the page's driver."""
     names = (f"{i:08d}" for i in itertools.count(1))
-    driver = Driver(DriveLimits(**limits), "ada", 1.0, lambda: next(names))
+    picture_us = None if picture_ms is None else picture_ms * 1000
+    driver = Driver(DriveLimits(**limits), "ada", 1.0, lambda: next(names), picture_us=picture_us)
     now = due = 1_000_000
-    link, sent, arriving = dict(LINK), [], []
+    see, shown = None, 0
+
+    def look() -> None:
+        nonlocal shown
+        if see is not None:
+            shown += 1
+            driver.see(shown, see * 1000, now * 1000)
+
+    link, sent, arriving, behind = dict(LINK), [], [], []
     for times, change in ((step[0], step[1] if step[1:] else {}) for step in steps):
+        see = change.get("see", see)
+        look()
+        if "shown" in change:
+            driver.see(None, 0, now * 1000)
+        driver.blind = change.get("blind", driver.blind)
         if "hold" in change:
             driver.hold(held=change["hold"], now_us=now * 1000)
         now += change.get("pause", 0)
@@ -55,9 +70,11 @@ def driven(limits: Mapping[str, Any], steps: list[Any]) -> dict[str, Any]:
             command = driver.tick(now * 1000)
             if command is not None:
                 sent.append((now, decode_command(encode_command(command))))
+                behind.append(None if command.frame is None else shown - command.frame)
                 if not link["deaf"]:
                     arriving.append((now + 2 * link["way"], command))
             now += 50
+            look()
             came = [one for at, one in arriving if at <= now]
             arriving = [one for one in arriving if one[0] > now]
             if link["silent"] or now < due:
@@ -80,16 +97,22 @@ def driven(limits: Mapping[str, Any], steps: list[Any]) -> dict[str, Any]:
         "phase": driver.phase.value,
         "reason": driver.reason,
         "sent": sent,
+        "behind": None if picture_ms is None else behind,
         "rtt_ms": None if driver.rtt_us is None else driver.rtt_us / 1000,
     }
 
 
 def told(driver: Mapping[str, Any]) -> dict[str, Any]:
     """A driver's doing as the vectors have it: how many commands of each kind, one after the other."""
-    kinds = (
+    kinds = [
         [one.session, *one.message["drive"].values(), one.lease_ms, one.takeover, one.ends]
         for _, one in driver["sent"]
-    )
+    ]
+    if driver["behind"] is not None:
+        kinds = [
+            [*kind, behind, one.blind]
+            for kind, behind, (_, one) in zip(kinds, driver["behind"], driver["sent"], strict=True)
+        ]
     runs = [[len(list(same)), *kind] for kind, same in itertools.groupby(kinds)]
     ahead_us = [one.sent_us - at * 1000 for at, one in driver["sent"]][-1:]
     return {"phase": driver["phase"], "rtt_ms": driver["rtt_ms"], "commands": runs, "ahead_us": ahead_us}
@@ -97,7 +120,8 @@ def told(driver: Mapping[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("vector", VECTORS["vectors"], ids=lambda vector: vector["name"])
 def test_the_driver_does_what_the_vectors_say(vector: Any) -> None:
-    assert told(driven(VECTORS["limits"], vector["steps"])) == vector["expected"]
+    done = driven(VECTORS["limits"], vector["steps"], vector.get("picture_ms"))
+    assert told(done) == vector["expected"]
 
 
 HELD = [[4], [20, {"hold": True, "stick": {"x": 1, "y": 1}}]]
