@@ -29,7 +29,9 @@ from iort_agent.recorder.config import RecorderConfig
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
 from iort_agent.sources.ros import RosConfig
+from iort_agent.sources.sim import SimConfig
 from iort_agent.spool import QueueConfig, default_path
+from iort_agent.video.config import SIM, TOPIC, V4L2, VideoConfig, video_rule
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 from iort_contract.messages.shadow import SETTINGS
@@ -60,6 +62,7 @@ class Config:
     queue: QueueConfig = setting(section(QueueConfig), QueueConfig())
     files: FilesConfig = setting(section(FilesConfig), FilesConfig())
     recorder: RecorderConfig | None = setting(section(RecorderConfig), None)
+    video: VideoConfig | None = setting(video_rule(), None)
     metrics: MetricsConfig = setting(section(MetricsConfig), MetricsConfig())
     downlink: DownlinkConfig = setting(section(DownlinkConfig), DownlinkConfig())
     motion: MotionState = setting(section(MotionState), MotionState())
@@ -91,6 +94,7 @@ def load_config(file: Path) -> Config:
     except ContractError as error:
         raise place.child("downlink.drive").problem(str(error)) from error
     _check_streams(config, place.child("sources"))
+    _check_video(config, place.child("video"))
     for i, source in enumerate(config.sources):
         if config.recorder is None and isinstance(source, RosConfig) and source.has_ring():
             raise (
@@ -114,11 +118,26 @@ def without_sources(config: Config) -> Config:
         config,
         sources=(),
         recorder=None if recorder is None else replace(recorder, service=None, topic=None),
+        video=None,
         share=(),
         downlink=DownlinkConfig(),
         ping=PingConfig(),
         metrics=MetricsConfig(enabled=False),
     )
+
+
+def _check_video(config: Config, place: Place) -> None:
+    """The camera must be that of a source, if it is one's."""
+    if config.video is None:
+        return
+    kind, place = config.video.source.kind, place.child("source")
+    if kind == TOPIC and config.downlink.graph(config.sources).node is None:
+        raise place.problem(
+            "the topic is heard by the node of the sources, and none of them is a ros1 or ros2: "
+            f"add one to sources, or take the camera itself (type: {V4L2})"
+        )
+    if kind == SIM and not any(isinstance(source, SimConfig) for source in config.sources):
+        raise place.problem("needs a simulated car: a source of the type sim")
 
 
 def _check_streams(config: Config, place: Place) -> None:

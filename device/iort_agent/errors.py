@@ -50,6 +50,10 @@ class UploadError(AgentError):
         self.again_s = again_s
 
 
+class VideoError(AgentError):
+    """A camera or the encoder cannot work, or not now; the text says what to do."""
+
+
 class AskError(AgentError):
     """A question to the cloud has no answer; ``reason`` is the cloud's word for why, or the agent's."""
 
