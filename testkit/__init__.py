@@ -1,4 +1,4 @@
-"""What `bench`, `verify` and `tests` share: clients, waiting, fakes, a car, ROS."""
+"""What `bench`, `verify` and `tests` share: clients, waiting, fakes, a car, ROS, a bad network."""
 
 from pathlib import Path
 

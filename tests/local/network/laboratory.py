@@ -23,8 +23,8 @@ from iort_station.cloud import EMBEDDED_VARIABLE
 from local.deployment import ROOT
 from local.processes import Child
 from testkit import machine
+from testkit.namespaces import ANY, Machine
 from testkit.waiting import GUARD_S, InstrumentError, until
-from tests.local.network.namespaces import ANY, Machine
 
 BIN = Path(sys.executable).parent
 
