@@ -23,7 +23,7 @@ from iort_agent.common.state import (
 )
 from iort_agent.common.threads import WATCH, Clock
 from iort_agent.config import Config
-from iort_agent.control.commands import Operator, refuse_commands
+from iort_agent.control.commands import Operator, Sight, refuse_commands
 from iort_agent.control.downlink import make_downlink
 from iort_agent.control.guard import NODES, StopFile
 from iort_agent.control.shadow import NO_RECORDER, Shadow
@@ -47,6 +47,7 @@ from iort_agent.ros.ros1_node import DEFAULT_NODE
 from iort_agent.sources.registry import SourceRun
 from iort_agent.sources.sim import SimSource
 from iort_agent.spool import Spool
+from iort_agent.video import Pictures
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.cloud import IOT
 from iort_contract.limits import Value
@@ -144,6 +145,9 @@ class Agent:
         uploader = None
         if config.files.folder or config.files.large_folder or config.downlink.ask or self.recorder:
             uploader = make_uploader(link, root_ca=config.root_ca, rate_kb_s=config.files.rate_kb_s)
+        # Motion is bound to them also if the camera does not work.
+        self.pictures = Pictures()
+        video = config.video
         self.downlink = make_downlink(
             config.downlink,
             config.share,
@@ -156,6 +160,7 @@ class Agent:
             uploader=uploader,
             root_ca=config.root_ca,
             queue=config.queue.path,
+            sight=Sight(video.max_age_ms, self.pictures.age_ms) if video is not None else None,
         )
         if self.downlink is None:
             refuse_commands(link, self.shadow.answer)

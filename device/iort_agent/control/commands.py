@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 from dataclasses import dataclass, replace
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Callable, Mapping, NamedTuple, Sequence
 
 from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.schema import did_you_mean
@@ -65,6 +65,14 @@ def _with(message: Mapping[str, Any], path: list[str], value: float) -> dict[str
     return {**message, name: _with(message[name], below, value) if below else value}
 
 
+class Sight(NamedTuple):
+    """What a robot with video knows of its pictures. ``age_ms`` tells the age of the picture with a number at
+    a monotonic time; None for one that it does not know. It must answer at once."""
+
+    max_age_ms: int
+    age_ms: Callable[[int, float], float | None]
+
+
 class Motion:
     """What moves the robot by one ROS topic: its lease, whichever commands renew it, and its stop."""
 
@@ -74,8 +82,9 @@ class Motion:
         self.stopping = False
         # What the guard knows: the lease's end, and whether an emergency stop holds.
         self.guarded: tuple[float | None, bool] = (None, False)
-        # The name of the newest command that passed.
+        # The name of the newest command that passed, and the age of its picture when it came.
         self.last: Named | None = None
+        self.picture_ms: float | None = None
         self.stops = 0
         # The newest stop could not be published: the agent is not in the ROS graph.
         self.unheard = False
@@ -104,11 +113,12 @@ class Named:
         skew_s: float,
         motion: Motion | None,
         limits: DriveLimits | None,
+        picture_ms: float | None,
     ) -> None:
         self.name, self.config, self.definition = name, config, definition
         self.motion, self.limits = motion, limits
         lease_s = config.motion.lease_s if config.motion is not None else None
-        self.allowed = Limits(config.max_age_s, skew_s, lease_s)
+        self.allowed = Limits(config.max_age_s, skew_s, lease_s, picture_ms)
         self.leases = motion.leases if motion is not None else Leases()
         self.passed = self.limited = 0
         # When the next refused motion becomes a sample.
@@ -133,8 +143,11 @@ class Named:
     def data(self, message: Mapping[str, Any], now_us: int) -> bytes:
         return encode(self.definition, message, now_us=now_us, partial=self.config.partial)
 
-    def sample(self, command: Command, outcome: str, now: float) -> Mapping[str, Value]:
-        """A sample of the stream `DRIVE_STREAM`; speed and steering are what the robot was told."""
+    def sample(
+        self, command: Command, outcome: str, now: float, picture_ms: float | None
+    ) -> Mapping[str, Value]:
+        """A sample of the stream `DRIVE_STREAM`; speed and steering are what the robot was told.
+        ``picture_ms`` is the age of the command's picture when it came."""
         driver, limits = self.leases.driver(now), self.limits
         speed = steering = None
         if limits is not None and outcome in (ACCEPTED, STOPPED):
@@ -152,6 +165,12 @@ class Named:
             "lease_left_ms": round(self.leases.left_s(now) * 1000),
             "speed": speed,
             "steering": steering,
+            "frame": command.frame,
+            # A picture that is no longer known is infinitely old.
+            "frame_age_ms": round(picture_ms, 1)
+            if picture_ms is not None and picture_ms < math.inf
+            else None,
+            "blind": command.blind,
         }
 
     def report(self) -> dict[str, int]:
@@ -205,7 +224,8 @@ def _all(link: Link) -> str:
 
 class Commands:
     """Publishes commands that may pass, and stops when a lease ends. ``wake`` is called when a stop may be
-    due earlier. The ``guard`` knows the end of each lease before a command passes.
+    due earlier. The ``guard`` knows the end of each lease before a command passes. With ``sight`` a motion
+    passes only by a picture, or blind.
 
     Raises `SourceError` for a ROS type that is not installed, `ConfigError` for a stop that does not fit its
     type.
@@ -219,7 +239,9 @@ class Commands:
         operator: Operator,
         guard: Guard | None,
         wake: Callable[[], None],
+        sight: Sight | None = None,
     ) -> None:
+        self._sight = sight
         self._bridge, self._graph, self._clock = bridge, bridge.graph, bridge.link.clock
         self._operator, self._guard, self._wake = operator, guard, wake
         self._lock = threading.Lock()
@@ -234,7 +256,13 @@ class Commands:
                 moved = Motion(settings.topic, settings.motion.stop, definition)
                 motion = self._motions.setdefault(settings.topic, moved)
             command = Named(
-                name, settings, definition, skew_s=config.clock_skew_s, motion=motion, limits=limits
+                name,
+                settings,
+                definition,
+                skew_s=config.clock_skew_s,
+                motion=motion,
+                limits=limits,
+                picture_ms=sight.max_age_ms if sight is not None else None,
             )
             command.check(self._clock.now_us())
             self._commands[bridge.link.topic(CMD, name)] = command
@@ -340,13 +368,21 @@ class Commands:
         command, last = motion.last, motion.leases.last
         what = f"command {command.name}" if command is not None else motion.topic
         _log.warning("%s: %s, stopping", what, motion.leases.why_stopped())
-        return [] if command is None or last is None else [command.sample(last, STOPPED, now)]
+        return (
+            [] if command is None or last is None else [command.sample(last, STOPPED, now, motion.picture_ms)]
+        )
 
     def _unready(self) -> str | None:
         """Why no motion may pass yet."""
         if not self._operator.settings_known():
             return SETTINGS_UNKNOWN
         return NO_GUARD if self._guard is not None and not self._guard.ready() else None
+
+    def _picture_ms(self, command: Command, now: float) -> float | None:
+        """The age of the picture that a command names."""
+        if self._sight is None or command.frame is None:
+            return None
+        return self._sight.age_ms(command.frame, now)
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - as the uplink calls it
         if connected:
@@ -389,10 +425,14 @@ class Commands:
             data = command.data(offered.message, self._clock.now_us())
         except MessageError as error:
             return ("malformed", str(error)), None
-        motion = command.motion
+        motion, asked = command.motion, self._clock.monotonic()
+        # Before the lock, so that no stop waits for the pictures.
+        picture_ms = self._picture_ms(offered, asked)
         # All times under the lock, for which the command may have waited.
         with self._lock:
             now, now_us = self._clock.monotonic(), self._clock.now_us()
+            if picture_ms is not None:
+                picture_ms += (now - asked) * 1000
             offset = self._bridge.offset()
             uncertainty_us = None
             if offset is not None:
@@ -401,10 +441,15 @@ class Commands:
             reason = self._unready() if motion is not None else None
             if reason is None:
                 reason = command.leases.offer(
-                    offered, command.allowed, now_us=now_us, uncertainty_us=uncertainty_us, now=now
+                    offered,
+                    command.allowed,
+                    now_us=now_us,
+                    uncertainty_us=uncertainty_us,
+                    now=now,
+                    picture_ms=picture_ms,
                 )
             if reason is None and motion is not None:
-                motion.last = command
+                motion.last, motion.picture_ms = command, picture_ms
                 motion.stopping = motion.stopping and offered.ends
                 # Before the robot moves.
                 if not self._tell_guard(motion):
@@ -416,7 +461,7 @@ class Commands:
             sample = None
             if motion is not None and (reason is None or now >= command.refused_due):
                 command.refused_due = now + _REFUSED_S if reason is not None else command.refused_due
-                sample = command.sample(offered, reason or ACCEPTED, now)
+                sample = command.sample(offered, reason or ACCEPTED, now, picture_ms)
         if reason is None:
             return None, sample
         ago_s = (now_us - offered.sent_us) / 1e6

@@ -10,7 +10,7 @@ from typing import Any, Callable, Iterable, Sequence
 from iort_agent.common.state import ClockOffset
 from iort_agent.common.threads import Supervised
 from iort_agent.control import Bridge
-from iort_agent.control.commands import Commands, Operator
+from iort_agent.control.commands import Commands, Operator, Sight
 from iort_agent.control.config import DownlinkConfig, ShareConfig
 from iort_agent.control.guard import NODES, Guard
 from iort_agent.control.peers import Peers, Shares
@@ -43,11 +43,13 @@ class Downlink:
         operator: Operator,
         guard: Guard | None = None,
         questions: Questions | None = None,
+        sight: Sight | None = None,
     ) -> None:
         self._clock, self._bridge, self._guard = bridge.link.clock, bridge, guard
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread = Supervised("downlink", self._run)
-        self._commands = Commands(config, bridge, operator=operator, guard=guard, wake=self._wake.set)
+        wake = self._wake.set
+        self._commands = Commands(config, bridge, operator=operator, guard=guard, wake=wake, sight=sight)
         self._peers = Peers(config, bridge)
         self._shares = Shares(share, bridge, boot=boot, wake=self._wake.set)
         self._asks = Asks(config.ask, bridge, questions) if questions is not None else None
@@ -136,6 +138,7 @@ def make_downlink(
     uploader: Uploader | None = None,
     root_ca: Path | None = None,
     queue: Path | None = None,
+    sight: Sight | None = None,
 ) -> Downlink | None:
     """The downlink of a configuration that has one: in the ROS node of the sources, or in a ``graph`` that is
     no ROS graph if they need no node.
@@ -158,4 +161,6 @@ def make_downlink(
     if config.ask and uploader is not None:
         questions = Questions(link, uploader, download=downloader(root_ca), offset=offset)
     bridge = Bridge(link, graph, offset)
-    return Downlink(config, share, bridge, boot=boot, operator=operator, guard=guard, questions=questions)
+    return Downlink(
+        config, share, bridge, boot=boot, operator=operator, guard=guard, questions=questions, sight=sight
+    )

@@ -22,6 +22,11 @@ the robot at the moment when the other driver lets go, or when the stop is relea
 What a session has sent before its lease ended moves nothing after the stop, even if it came late and its own
 lease still holds.
 
+A robot with video is driven by sight: a motion passes only if the picture that its driver saw is young enough
+when it comes, or if he says that he drives blind. One that ends the lease always does. This is asked last, so
+that an emergency stop, another driver or an old command is told as what it is, and a late picture takes
+nothing over.
+
 Only a command later than all that passed may pass. Commands carry the cloud's time. The robot knows it to
 within the uncertainty of its measured offset (`iort_agent.lanes.pings`), and counts a command as old
 as it may be. Without a known offset, no motion command passes. Leases run on the monotonic clock.
@@ -42,6 +47,8 @@ from iort_contract.messages.commands import (
     EMERGENCY_STOP,
     LEASE_OVER,
     NO_LEASE,
+    NO_PICTURE,
+    PICTURE_LATE,
     REPEATED,
     STALE,
     SUPERSEDED,
@@ -122,11 +129,13 @@ class Stops:
 
 
 class Limits(NamedTuple):
-    """The robot's limits for all commands of a name. ``lease_s`` is None for commands that move nothing."""
+    """The robot's limits for all commands of a name. ``lease_s`` is None for commands that move nothing,
+    ``picture_ms`` for a robot without video."""
 
     max_age_s: float
     max_ahead_s: float
     lease_s: float | None = None
+    picture_ms: float | None = None
 
 
 class Leases(Stops):
@@ -141,12 +150,20 @@ class Leases(Stops):
         self._closed = False
 
     def offer(
-        self, command: Command, limits: Limits, *, now_us: int, uncertainty_us: int | None, now: float
+        self,
+        command: Command,
+        limits: Limits,
+        *,
+        now_us: int,
+        uncertainty_us: int | None,
+        now: float,
+        picture_ms: float | None = None,
     ) -> str | None:
         """None if the command may pass, and it counts as passed; otherwise the reason.
 
         ``limits`` are those of the command's name. ``now_us`` is the cloud's time to within
-        ``uncertainty_us``; the robot's own time if that is None.
+        ``uncertainty_us``; the robot's own time if that is None. ``picture_ms`` is the age of the picture
+        that the command names; None if there is none, or the robot does not know it.
         """
         # In an agent that was frozen, a command may come before the stop.
         self.expire(now)
@@ -154,7 +171,11 @@ class Leases(Stops):
         lease_s = _lease_s(command, limits, age_us)
         reason = self._rejection(command, limits, age_us, uncertainty_us, lease_s)
         if reason is None and lease_s is not None:
-            reason = self._other_driver(command, now) or self._stopped_since(command, age_us, now)
+            reason = (
+                self._other_driver(command, now)
+                or self._stopped_since(command, age_us, now)
+                or _unseen(command, limits, picture_ms)
+            )
         if reason is not None:
             return reason
         self.last = command
@@ -240,6 +261,15 @@ class Leases(Stops):
         if last is not None and command.order <= last.order:
             return REPEATED if command.session == last.session else SUPERSEDED
         return None
+
+
+def _unseen(command: Command, limits: Limits, picture_ms: float | None) -> str | None:
+    """Why a motion may not pass by what its driver saw."""
+    if limits.picture_ms is None or command.blind or command.ends:
+        return None
+    if command.frame is None:
+        return NO_PICTURE
+    return None if picture_ms is not None and picture_ms <= limits.picture_ms else PICTURE_LATE
 
 
 def _lease_s(command: Command, limits: Limits, age_us: int) -> float | None:

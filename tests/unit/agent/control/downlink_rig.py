@@ -15,7 +15,7 @@ from typing import Any
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
 from iort_agent.control import Bridge
-from iort_agent.control.commands import Operator
+from iort_agent.control.commands import Operator, Sight
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
 from iort_agent.control.leases import STOP_AHEAD_MS
@@ -200,7 +200,7 @@ CONFIG: dict[str, Any] = {
 class Rig:
     def __init__(
         self, robot: str = "car1", *, share: Any = None, uplink: Loopback | None = None, clock: Any = None,
-        graph: Any = None, guard: Any = None, **config: Any,
+        graph: Any = None, guard: Any = None, sight: Sight | None = None, **config: Any,
     ) -> None:  # fmt: skip
         self.clock = clock or ManualClock(now_us=T0)
         self.dispatcher = Dispatcher()
@@ -224,6 +224,7 @@ class Rig:
             Bridge(link_of(self.uplink, self.clock, robot=robot), graph or self.graph, lambda: self.offset),
             boot="0badcafe",
             guard=guard,
+            sight=sight,
             operator=Operator(
                 lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),
                 self.drove.append,

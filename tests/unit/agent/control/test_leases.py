@@ -19,6 +19,8 @@ from iort_contract.messages.commands import (
     EMERGENCY_STOP,
     LEASE_OVER,
     NO_LEASE,
+    NO_PICTURE,
+    PICTURE_LATE,
     REPEATED,
     STALE,
     SUPERSEDED,
@@ -70,6 +72,62 @@ def test_a_single_command(
     offer = leases.offer(command(**changes), LIMITS, now_us=T0, uncertainty_us=uncertainty_us, now=7)
     assert offer == refusal
     assert leases.next_due() == (None if left_s is None else pytest.approx(7 + left_s, abs=1e-5))
+
+
+SIGHTED = LIMITS._replace(picture_ms=500)
+
+
+@pytest.mark.parametrize(
+    ("changes", "picture_ms", "refusal"),
+    [
+        ({"frame": 7}, 500.0, None),
+        ({"frame": 7}, 501.0, PICTURE_LATE),
+        ({"frame": 7}, None, PICTURE_LATE),
+        ({"frame": 7}, float("inf"), PICTURE_LATE),
+        ({"frame": 7}, float("nan"), PICTURE_LATE),
+        ({}, None, NO_PICTURE),
+        ({"frame": 7, "blind": True}, 501.0, None),
+        ({"blind": True}, None, None),
+        ({"frame": 7, "ends": True}, 501.0, None),
+        ({"ends": True}, None, None),
+        # What else is against it goes first.
+        ({"frame": 7, "sent_us": T0 - 800_001}, 501.0, STALE),
+        ({"sent_us": T0 - 300_000}, None, LEASE_OVER),
+        ({"lease_ms": None}, None, NO_LEASE),
+    ],
+)
+def test_a_motion_by_a_picture(
+    changes: dict[str, Any], picture_ms: float | None, refusal: str | None
+) -> None:
+    settings: dict[str, Any] = {"now_us": T0, "uncertainty_us": 0, "now": 7, "picture_ms": picture_ms}
+    leases = Leases()
+    assert leases.offer(command(**changes), SIGHTED, **settings) == refusal
+    assert (leases.last is None) == (leases.next_due() is None) == (refusal is not None)
+    if changes.keys() <= {"frame", "blind", "ends"}:
+        assert Leases().offer(command(**changes), LIMITS, **settings) is None, "a robot without video"
+        nothing = SIGHTED._replace(lease_s=None)
+        assert Leases().offer(command(**changes), nothing, **settings) is None, "what moves nothing"
+
+
+def test_a_late_picture_takes_no_wheel_and_costs_no_session() -> None:
+    leases = Leases()
+
+    def offer(letter: str, seq: int, picture_ms: float, **changes: Any) -> str | None:
+        one = command(
+            seq, session=letter * 8, started_us=T0 - 1_000_000 + int(letter, 16), frame=7, **changes
+        )
+        return leases.offer(one, SIGHTED, now_us=T0, uncertainty_us=0, now=7, picture_ms=picture_ms)
+
+    assert offer("a", 0, 100) is None
+    assert offer("b", 0, 501, takeover=True) == PICTURE_LATE
+    assert offer("a", 1, 501) == PICTURE_LATE
+    assert offer("a", 2, 100) is None, "its picture is live again"
+    assert offer("b", 1, 501) == DRIVEN_BY_ANOTHER, "what else is against it goes first"
+    assert offer("a", 2, 501) == REPEATED
+    leases.hold(7)
+    assert offer("c", 0, 501) == EMERGENCY_STOP
+    leases.free()
+    assert offer("c", 1, 100) == BEGIN_AGAIN
 
 
 def test_a_command_without_motion_needs_no_lease_and_no_stop() -> None:
@@ -221,8 +279,10 @@ def left_s(motion: Command, latest_us: int) -> float:
 class Model:
     """The leases, and what must be true of them."""
 
-    def __init__(self) -> None:
-        self.leases = Leases()
+    def __init__(self, limits: Limits = LIMITS) -> None:
+        self.leases, self.limits = Leases(), limits
+        self.captured: list[float] = []  # when each picture was taken
+        self.seq = 0
         self.now, self.offset_us = 0.0, 0
         self.uncertainty_us: int | None = 0
         self.closed = self.held = False
@@ -236,6 +296,9 @@ class Model:
         said = self.leases.stop_due(self.now)
         assert said == (due is not None and due <= self.now)
         assert due is not None or not self.held, "an emergency stop goes on"
+        if self.limits.picture_ms is not None and self.moving_until is not None and not self.passed[-1].blind:
+            frozen = self.now - max(self.captured, default=0.0)
+            assert frozen <= self.limits.picture_ms / 1000 + 0.5 + TICK, "no longer than a lease"
         if self.moving_until is not None and self.now >= self.moving_until:
             assert said, "a stop follows the last motion by the first tick after its lease"
             self.moving_until, self.stopped = None, self.now
@@ -269,11 +332,14 @@ class Model:
     def offer(self, event: Command) -> None:
         now_us = T0 + round(self.now * 1e6) + self.offset_us
         uncertainty_us = self.uncertainty_us
-        if (
-            self.leases.offer(event, LIMITS, now_us=now_us, uncertainty_us=uncertainty_us, now=self.now)
-            is not None
-        ):
+        known = event.frame is not None and event.frame <= len(self.captured)
+        picture_ms = (self.now - self.captured[event.frame - 1]) * 1000 if known else None
+        times: dict[str, Any] = {"now_us": now_us, "uncertainty_us": uncertainty_us, "now": self.now}
+        if self.leases.offer(event, self.limits, **times, picture_ms=picture_ms) is not None:
             return
+        if self.limits.picture_ms is not None and not (event.blind or event.ends):
+            assert picture_ms is not None
+            assert picture_ms <= self.limits.picture_ms
         assert not self.closed
         assert not self.held
         assert uncertainty_us is not None
@@ -287,13 +353,44 @@ class Model:
         if self.passed and event.session == self.passed[-1].session:
             assert self.now - (now_us + uncertainty_us - event.sent_us) / 1e6 >= self.stopped
         self.passed.append(event)
-        self.moving_until = self.now + left_s(event, now_us + uncertainty_us)
+        rest_s = left_s(event, now_us + uncertainty_us)
+        self.moving_until = self.now if event.ends else self.now + rest_s
 
 
 @given(EVENTS)
 @example([(1,), command(seq=0, sent_us=T0 + 500_001, valid_ms=1, lease_ms=1)])
 def test_the_promises_hold_for_any_events(events: list[Any]) -> None:
-    model = Model()
+    happen(events, Model())
+
+
+SEEING = st.lists(
+    st.one_of(
+        st.fixed_dictionaries(
+            {
+                "session": st.sampled_from(["0badcafe", "1badcafe"]),
+                "takeover": st.booleans(),
+                "ends": st.sampled_from([False, False, True]),
+                "ago_us": st.sampled_from([0, 0, 100_000]),
+                "lease_ms": st.integers(1, 2000),
+                # How many pictures ago; -1 is one that is not taken yet.
+                "behind": st.sampled_from([None, -1, 0, 0, 0, 1, 2]),
+                "blind": st.sampled_from([False, False, False, True]),
+            }
+        ),
+        st.floats(0, 0.6, allow_nan=False),
+        st.sampled_from(["picture", "picture", "hold", "free"]),
+    ),
+    max_size=60,
+)
+
+
+@given(SEEING)
+def test_a_picture_that_freezes_ends_motion_within_its_limit_and_a_lease(events: list[Any]) -> None:
+    happen(events, Model(SIGHTED))
+
+
+def happen(events: list[Any], model: Model) -> None:
+    """Let the events happen, and what must be true then."""
     for event in events:
         if isinstance(event, float):
             model.wait(event)
@@ -301,6 +398,14 @@ def test_the_promises_hold_for_any_events(events: list[Any]) -> None:
             model.end(event)
         elif event == "free":
             model.free()
+        elif isinstance(event, dict):
+            behind, now_us = event["behind"], T0 + round(model.now * 1e6) - event["ago_us"]
+            frame = None if behind is None else max(1, len(model.captured) - behind)
+            changes = {key: event[key] for key in ("session", "takeover", "ends", "lease_ms", "blind")}
+            model.seq += 1
+            model.offer(command(model.seq, **changes, sent_us=now_us, frame=frame))
+        elif event == "picture":
+            model.captured.append(model.now)
         elif isinstance(event, tuple):
             (model.uncertainty_us,) = event
         elif isinstance(event, str):
