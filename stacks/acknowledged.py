@@ -14,7 +14,9 @@ from aws_cdk import Acknowledgment, App, CfnResource, Stack, Validations
 from aws_cdk import aws_iam as iam
 from constructs import IConstruct
 
-from iort_contract.topics import SHADOW
+from iort_contract.messages.live import LEASE
+from iort_contract.messages.video import PICTURE, TO, VIDEO
+from iort_contract.topics import SHADOW, VIEW
 from stacks.settings import Settings
 
 _NAG_PACKS = ("AwsSolutions", "Serverless")
@@ -196,12 +198,26 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
                 wide(
                     f"{iot}:client/{settings.namespace}-{person.lower()}-*"
                 ): "every connection has its own id",
-                **{wide(f"{iot}:{what}/{settings.namespace}/*"): every_robot for what in topics},
+                **{
+                    wide(f"{iot}:{what}/{settings.namespace}/*"): every_robot
+                    for what in ("topicfilter/live", "topic/live", *lanes)
+                },
+                **{
+                    wide(f"{iot}:{kind}/{VIEW}/{settings.namespace}/*/{name}"): every_robot
+                    for kind, names in {
+                        "topicfilter": (PICTURE,),
+                        "topic": (PICTURE, LEASE, VIDEO),
+                    }.items()
+                    for name in names
+                },
+                **{
+                    wide(f"{iot}:{kind}/{VIEW}/{settings.namespace}/*/{TO}*"): (
+                        f"{every_robot}; the last one is the viewer's random name"
+                    )
+                    for kind in ("topicfilter", "topic")
+                },
             }
-            for person, topics in {
-                "Viewer": ("topicfilter/live", "topic/live", "topic/view"),
-                "Driver": ("topicfilter/live", "topic/live", "topic/view", "topic/cmd"),
-            }.items()
+            for person, lanes in {"Viewer": (), "Driver": ("topic/cmd",)}.items()
         },
         "fleet/PublicRole/DefaultPolicy": {
             wide(f"{iot}:client/{settings.namespace}-viewer-*"): "every connection has its own id",

@@ -14,6 +14,8 @@ from aws_cdk import aws_lambda as lambda_
 from iort_contract.catalog.environments import RegistryEnvironment
 from iort_contract.catalog.streams import DRIVE_STREAM, LOG_STREAM
 from iort_contract.cloud import DRIVER, VIEWER, claim_name, client_prefix, fleet_name
+from iort_contract.messages.live import LEASE
+from iort_contract.messages.video import PICTURE, TO, VIDEO
 from iort_contract.tables import PRESENCE, ROBOT_PARAMETER, SERIAL_PARAMETER
 from iort_contract.topics import ASK, CMD, FLEET, LIVE, RECORD, SHADOW, VIEW, rule_name
 from stacks import parts
@@ -59,12 +61,21 @@ def public_identity(stack: PlatformStack) -> None:
     CfnOutput(stack, "PublicRobots", value=",".join(stack.settings.site_robots))
 
 
-def _person(stack: PlatformStack, name: str, *, publishes: list[str]) -> None:
-    """A role that people and programs of this account may assume, if their own policy says so."""
+def _person(stack: PlatformStack, name: str, *, commands: bool = False) -> None:
+    """A role that people and programs of this account may assume, if their own policy says so.
+
+    Whoever looks hears pictures, and the answers to a viewer whose name it knows: in MQTT a wildcard is a
+    whole level, so no subscription to the answers matches two names. It hears no other viewer's offer, and
+    cannot answer in a robot's place.
+    """
     role = iam.Role(stack, name.capitalize(), assumed_by=iam.AccountRootPrincipal())
     _listens(stack, role, name, robots=ALL_ROBOTS)
-    topics = [f"{lane}/{stack.settings.namespace}/*" for lane in publishes]
-    _rule(stack, role, "Publish", "topic", topics)
+    namespace = stack.settings.namespace
+    seen = [f"{VIEW}/{namespace}/*/{name}" for name in (PICTURE, f"{TO}*")]
+    _rule(stack, role, "Subscribe", "topicfilter", seen)
+    _rule(stack, role, "Receive", "topic", seen)
+    sent = [f"{VIEW}/{namespace}/*/{name}" for name in (LEASE, VIDEO)]
+    _rule(stack, role, "Publish", "topic", sent + [f"{CMD}/{namespace}/*"] * commands)
     CfnOutput(stack, f"{name.capitalize()}Role", value=role.role_arn)
 
 
@@ -245,10 +256,11 @@ class Fleet(PlatformStack):
         # RegisterThing needs them: AWS tests role and hook when it creates the template.
         for needed in (robot_type, robots, policy, role, asking):
             template.node.add_dependency(needed)
-        # A viewer sees every car, and may ask it for its live messages; a driver also sends commands.
-        _person(self, VIEWER, publishes=[VIEW])
+        # A viewer sees every car, and may ask it for its live messages and its video; a driver also sends
+        # commands.
+        _person(self, VIEWER)
         if settings.drivers:
-            _person(self, DRIVER, publishes=[VIEW, CMD])
+            _person(self, DRIVER, commands=True)
         if settings.public:
             public_identity(self)
         CfnOutput(self, "LiveTransport", value=settings.live_transport)

@@ -14,6 +14,7 @@ from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.streams import DRIVE_STREAM, LOG_STREAM
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.messages.live import LEASE, lease_topic
+from iort_contract.messages.video import answer_topic, look_topic, picture_topic
 from iort_contract.topics import (
     ANSWER,
     ASK,
@@ -37,6 +38,8 @@ from iort_contract.topics import (
 # Robot A makes the attempts; B is its neighbour.
 A, B = "isolated-a", "isolated-b"
 ROBOT, CLAIM = "robot A", "claim"
+# The names of two viewers.
+ME, OTHER = "0badcafe", "5ca1ab1e"
 # IAM roles: of the operator's people, and of whoever opens the page on the web.
 VIEWER, DRIVER, EVERYBODY = "viewer", "driver", "everybody"
 CONNECT, PUBLISH, SUBSCRIBE, RECEIVE = "Connect", "Publish", "Subscribe", "Receive"
@@ -84,8 +87,11 @@ ROWS = [
             build_topic(PING, A, LAMBDA),
             build_topic(ASK, A, CALIBRATION.name),
             build_topic(ASK, A, "nobody"),
-            # It wakes only itself.
+            # It wakes only itself, and shows itself to itself.
             build_topic(VIEW, A, LEASE),
+            look_topic(A, "iort"),
+            answer_topic(A, ME, "iort"),
+            picture_topic(A, "iort"),
             f"{_shadow(A)}/get",
             f"{_shadow(A)}/update",
         ),
@@ -102,6 +108,10 @@ ROWS = [
             build_topic(ASK, B, CALIBRATION.name),
             build_topic(ANSWER, B, CALIBRATION.name),
             build_topic(VIEW, B, LEASE),
+            look_topic(B, "iort"),
+            answer_topic(B, ME, "iort"),
+            picture_topic(B, "iort"),
+            answer_topic(A, ME, "lab2"),
             f"{_shadow(B)}/update",
             f"{_shadow(B)}/get",
             f"{_shadow(B)}/delete",
@@ -150,6 +160,7 @@ ROWS = [
             f"{PONG}/iort/{A}/+",
             f"{ANSWER}/iort/{A}/+",
             build_topic(VIEW, A, LEASE),
+            look_topic(A, "iort"),
             build_topic(PING, A, BROKER),
             f"{PING}/iort/{A}/+",
             f"{FLEET}/iort/+/#",
@@ -171,6 +182,13 @@ ROWS = [
             f"{ANSWER}/iort/+/{CALIBRATION.name}",
             build_topic(VIEW, B, LEASE),
             f"{VIEW}/iort/+/{LEASE}",
+            look_topic(B, "iort"),
+            look_topic(A, "lab2"),
+            answer_topic(B, ME, "iort"),
+            picture_topic(B, "iort"),
+            f"{VIEW}/iort/+/video",
+            f"{VIEW}/iort/+/picture",
+            f"{VIEW}/iort/#",
             f"{ASK}/iort/{A}/+",
             f"{ASK}/iort/{B}/{CALIBRATION.name}",
             f"{LIVE}/iort/{A}/vesc",
@@ -210,6 +228,7 @@ ROWS = [
             build_topic(PONG, A, RULE),
             build_topic(ANSWER, A, CALIBRATION.name),
             build_topic(VIEW, A, LEASE),
+            look_topic(A, "iort"),
             build_topic(FLEET, B, "pose"),
             f"{_shadow(A)}/update/accepted",
         ),
@@ -218,6 +237,9 @@ ROWS = [
             build_topic(PONG, B, RULE),
             build_topic(ANSWER, B, CALIBRATION.name),
             build_topic(VIEW, B, LEASE),
+            look_topic(B, "iort"),
+            answer_topic(B, ME, "iort"),
+            picture_topic(B, "iort"),
             build_topic(LIVE, B, "vesc"),
             build_topic(PING, B, BROKER),
             f"{_shadow(B)}/update/accepted",
@@ -246,6 +268,9 @@ ROWS = [
             build_topic(CMD, A, "drive"),
             build_topic(FLEET, A, "pose"),
             build_topic(VIEW, A, LEASE),
+            look_topic(A, "iort"),
+            answer_topic(A, ME, "iort"),
+            picture_topic(A, "iort"),
             f"{_shadow(A)}/update",
             f"$aws/things/{A}/jobs/start-next",
             "anything/else",
@@ -264,12 +289,16 @@ ROWS = [
             "$aws/provisioning-templates/+/provision/json/accepted",
             f"{FLEET}/iort/+/#",
             build_topic(CMD, A, "drive"),
+            look_topic(A, "iort"),
+            answer_topic(A, ME, "iort"),
+            picture_topic(A, "iort"),
             f"{_shadow(A)}/update/accepted",
         ),
     ),
 ]
 
-_LEASES = (lease_topic(A, "iort"), lease_topic(B, "iort"))
+# What wakes a robot's live lane and its camera.
+_LOOKS = tuple(topic(robot, "iort") for topic in (lease_topic, look_topic) for robot in (A, B))
 _COMMANDS = (build_topic(CMD, A, "drive"), build_topic(CMD, B, "drive"))
 # What neither people nor everybody may send.
 _NOT_SENT = (
@@ -284,6 +313,11 @@ _NOT_SENT = (
     build_topic(ANSWER, A, CALIBRATION.name),
     build_topic(CMD, A, "drive", "lab2"),
     lease_topic(A, "lab2"),
+    look_topic(A, "lab2"),
+    # A false picture, a false answer: only the robot sends them.
+    picture_topic(A, "iort"),
+    answer_topic(A, OTHER, "iort"),
+    build_topic(VIEW, A, "anything"),
     f"{_shadow(A)}/update",
     f"{_shadow(A)}/get",
     f"$aws/events/presence/connected/{A}",
@@ -293,7 +327,15 @@ _NOT_SENT = (
 _HEARD = (f"{LIVE}/iort/+/+", f"{LIVE}/iort/{A}/+", f"{LIVE}/iort/{B}/vesc", f"{LIVE}/iort/#")
 # Live messages that are not for everybody: the agent's log, and who drives.
 _OPERATORS = (build_topic(LIVE, A, LOG_STREAM), build_topic(LIVE, B, DRIVE_STREAM))
+# Video: a robot's answers to a viewer, and its pictures over the broker.
+_SEEN = (answer_topic(A, ME, "iort"), answer_topic(B, ME, "iort"), picture_topic(A, "iort"))
 _NOT_HEARD = (
+    # Other viewers' offers, and their answers without knowing their names.
+    *(
+        f"{VIEW}/{levels}"
+        for levels in ("iort/+/video", f"iort/{A}/video", "iort/+/+", "iort/#", "+/+/+", "#")
+    ),
+    *(f"{VIEW}/lab2/{A}/{name}" for name in ("picture", f"to-{ME}")),
     *("#", "+/#", "+/iort/#", f"{LIVE}/#", f"{LIVE}/+/+/+", f"{LIVE}/lab2/+/+", "$aws/#"),
     *(f"{lane}/iort/{A}/+" for lane in (CMD, VIEW, RECORD, FLEET, PING, PONG, ASK, ANSWER)),
     f"{_shadow(A)}/update/accepted",
@@ -301,13 +343,13 @@ _NOT_HEARD = (
     f"$share/group/{CMD}/iort/{A}/#",
 )
 for _who, _client, _sends in (
-    (VIEWER, VIEWER, _LEASES),
-    (DRIVER, DRIVER, (*_LEASES, *_COMMANDS)),
+    (VIEWER, VIEWER, _LOOKS),
+    (DRIVER, DRIVER, (*_LOOKS, *_COMMANDS)),
     (EVERYBODY, VIEWER, ()),
 ):
     _others = (A, "iort", f"iort-{_client}", "iort-claim-1", f"lab2-{_client}-1", "anything")
     _other = DRIVER if _client == VIEWER else VIEWER
-    _rest = tuple(topic for topic in (*_LEASES, *_COMMANDS) if topic not in _sends)
+    _rest = tuple(topic for topic in (*_LOOKS, *_COMMANDS) if topic not in _sends)
     ROWS += [
         *_rows(_who, CONNECT, may=(f"iort-{_client}-1",), may_not=(*_others, f"iort-{_other}-1")),
         *_rows(_who, PUBLISH, may=_sends, may_not=(*_rest, *_NOT_SENT)),
@@ -316,9 +358,19 @@ for _who, _client, _sends in (
             _who,
             RECEIVE,
             may=(build_topic(LIVE, A, "vesc"), build_topic(LIVE, B, "pose")),
-            may_not=(build_topic(CMD, A, "drive"), lease_topic(A, "iort"), build_topic(FLEET, A, "pose")),
+            may_not=(
+                build_topic(CMD, A, "drive"),
+                lease_topic(A, "iort"),
+                look_topic(A, "iort"),
+                build_topic(FLEET, A, "pose"),
+            ),
         ),
-        *(Row(_who, does, what, _who != EVERYBODY) for does in (SUBSCRIBE, RECEIVE) for what in _OPERATORS),
+        *(
+            Row(_who, does, what, _who != EVERYBODY)
+            for does in (SUBSCRIBE, RECEIVE)
+            for what in (*_OPERATORS, *_SEEN)
+        ),
+        Row(_who, SUBSCRIBE, f"{VIEW}/iort/+/picture", _who != EVERYBODY),
     ]
 
 # Requests that every role of the stacks makes to every resource of a kind. Only the role that declares a

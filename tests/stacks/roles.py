@@ -82,13 +82,23 @@ READS_DRIVES = {
 PEOPLE = "arn:${AWS::Partition}:iam::${AWS::AccountId}:root"
 
 
-def person(name: str, *lanes: str) -> set[tuple[str, str]]:
-    """The permissions to connect, to hear robots' live messages, and to send to every robot on ``lanes``."""
+def listener(name: str) -> set[tuple[str, str]]:
+    """The permissions to connect, and to hear robots' live messages."""
     return {
         ("iot:Connect", f"{IOT}:client/iort-{name}-*"),
         ("iot:Subscribe", f"{IOT}:topicfilter/live/iort/*"),
         ("iot:Receive", f"{IOT}:topic/live/iort/*"),
-        *(("iot:Publish", f"{IOT}:topic/{lane}/iort/*") for lane in lanes),
+    }
+
+
+def person(name: str, *sends: str) -> set[tuple[str, str]]:
+    """The permissions to look at every robot, and to send on the topics."""
+    looks = {"view/iort/*/lease", "view/iort/*/video"}
+    return {
+        *listener(name),
+        *(("iot:Publish", f"{IOT}:topic/{topic}") for topic in (*looks, *sends)),
+        *(("iot:Subscribe", f"{IOT}:topicfilter/view/iort/*/{last}") for last in ("picture", "to-*")),
+        *(("iot:Receive", f"{IOT}:topic/view/iort/*/{last}") for last in ("picture", "to-*")),
     }
 
 
@@ -177,11 +187,11 @@ OF_RULES = {
 }
 
 # What everybody gets from the page on the web.
-PUBLIC = person("viewer")
+PUBLIC = listener("viewer")
 # For every role: who may assume it, and each action on each resource.
 ROLES = {
-    "Viewer": (PEOPLE, person("viewer", "view")),
-    "Driver": (PEOPLE, person("driver", "view", "cmd")),
+    "Viewer": (PEOPLE, person("viewer")),
+    "Driver": (PEOPLE, person("driver", "cmd/iort/*")),
     **{
         f"{name}Role": ("lambda.amazonaws.com", {(action, f"{name}Log.Arn") for action in LOG} | grants)
         for name, grants in OF_FUNCTIONS.items()

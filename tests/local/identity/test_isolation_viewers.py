@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from typing import Any
+from urllib.parse import urlsplit
 
 import aiohttp
 import pytest
@@ -13,19 +14,34 @@ from awscrt.exceptions import AwsCrtError
 from botocore import UNSIGNED
 from botocore.config import Config
 from botocore.credentials import ReadOnlyCredentials
+from paho.mqtt import client as paho
+from paho.mqtt.enums import CallbackAPIVersion
 from yarl import URL
 
+from iort_contract.messages.video import (
+    OFFER,
+    Look,
+    answer_topic,
+    decode_look,
+    encode_look,
+    look_topic,
+    picture_topic,
+)
 from iort_contract.topics import LIVE, build_topic
 from iort_station.errors import StationError
 from iort_station.fleet import broker
 from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role, signed_url
 from iort_station.page import motion
+from testkit.mqtt import Person as Client
+from testkit.mqtt import Robot
 from testkit.waiting import GUARD_S
 from tests.isolation import (
     CONNECT,
     DRIVER,
     EVERYBODY,
+    ME,
+    OTHER,
     PUBLISH,
     RECEIVE,
     ROWS,
@@ -116,6 +132,70 @@ def test_whoever_watches_hears_live_messages_and_no_other(embedded, people, who)
             data.publish(topic=topic, qos=1, payload=b"{}")
         assert ended.wait(GUARD_S)
     assert heard == {row.what for row in rows if row.allowed} | {last}
+
+
+def test_two_viewers_of_a_robot_hear_only_their_own_answers(embedded, people, bundle):
+    car = bundle()
+    offer = encode_look(Look(ME, "0badcafe", OFFER, sdp="v=0"))
+    answers = {ME: b"for me", OTHER: b"for another"}
+
+    def viewer(who: str, name: str) -> Client:
+        return Client(embedded.cloud, people[who].credentials(), f"iort-{who}-{name}")
+
+    with (
+        Robot(car.folder) as robot,
+        viewer(VIEWER, ME) as mine,
+        viewer(DRIVER, OTHER) as another,
+    ):
+        robot.online().subscribe(look_topic(car.robot, "iort"))
+        for person, name in ((mine, ME), (another, OTHER)):
+            person.online()
+            for heard in (answer_topic(car.robot, name, "iort"), picture_topic(car.robot, "iort")):
+                assert person.subscribe(heard) == "GRANTED_QOS_1"
+        mine.publish(look_topic(car.robot, "iort"), offer)
+        topic, asked = robot.next_message()
+        assert (topic, decode_look(asked).viewer) == (look_topic(car.robot, "iort"), ME)
+        for name, answer in answers.items():
+            robot.publish(answer_topic(car.robot, name, "iort"), answer)
+        robot.publish(picture_topic(car.robot, "iort"), b"picture")
+        for person, name in ((mine, ME), (another, OTHER)):
+            heard = [person.next_message() for _ in range(2)]
+            assert heard == [
+                (answer_topic(car.robot, name, "iort"), answers[name]),
+                (picture_topic(car.robot, "iort"), b"picture"),
+            ]
+
+
+@pytest.mark.parametrize("size", [128 * 1024 + 1, 1_000_000])
+def test_a_look_of_a_megabyte_ends_its_senders_session_alone(embedded, people, bundle, size):
+    """A viewer that is no library of AWS: those refuse to send it."""
+    car = bundle()
+    url = urlsplit(people[VIEWER].signed().url)
+    ended, connected = threading.Event(), threading.Event()
+    hostile = paho.Client(
+        CallbackAPIVersion.VERSION2, "iort-viewer-hostile", transport="websockets", protocol=paho.MQTTv311
+    )
+    hostile.ws_set_options(path=f"{url.path}?{url.query}")
+    if url.scheme == "wss":
+        hostile.tls_set(ca_certs=embedded.cloud.ca_bundle)
+    hostile.on_connect = lambda *_: connected.set()
+    hostile.on_disconnect = lambda *_: ended.set()
+    with (
+        Robot(car.folder) as robot,
+        Client(embedded.cloud, people[VIEWER].credentials(), "iort-viewer-other") as other,
+    ):
+        other.online()
+        robot.online().subscribe(look_topic(car.robot, "iort"))
+        hostile.connect(url.hostname or "", url.port or 443)
+        hostile.loop_start()
+        try:
+            assert connected.wait(GUARD_S)
+            hostile.publish(look_topic(car.robot, "iort"), b"x" * size, qos=1)
+            assert ended.wait(GUARD_S)
+        finally:
+            hostile.loop_stop()
+        assert other.publish(look_topic(car.robot, "iort"), b"{}") == "SUCCESS"
+        assert robot.next_message() == (look_topic(car.robot, "iort"), b"{}")
 
 
 def test_a_connection_without_a_valid_signature_is_refused(embedded, people):
