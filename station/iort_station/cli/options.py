@@ -208,6 +208,7 @@ State = Annotated[
     option("The state folder of `make up`. Default: the user's own.", envvar="IORT_STATE", metavar="FOLDER"),
 ]
 Token = Annotated[str, option("PubNub's access token for reading, if needed.", envvar="PUBNUB_ACCESS_TOKEN")]
+Blind = Annotated[bool, option("Move a car with a camera without its picture; recorded.", "--blind")]
 LiveWay = Annotated[
     Literal["pubnub", "iot"] | None,
     option("The way of live messages: PubNub, or AWS IoT's own. Default: the deployment's.", "--live"),

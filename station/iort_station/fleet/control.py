@@ -33,6 +33,7 @@ from iort_contract.messages.shadow import (
     decode_reported,
     nested,
 )
+from iort_contract.messages.video import VideoTerms
 from iort_contract.tables import DISCONNECTED_MS, ONLINE
 from iort_contract.topics import CMD, SHADOW, build_topic
 from iort_station.cloud import Cloud, invoke
@@ -289,6 +290,7 @@ VALID_MS, ANSWER_S = 2_000, 10.0
 _ADVICE = {
     commands.NO_LEASE: "say by --lease-ms how long it may move, such as --lease-ms 500",
     commands.DRIVEN_BY_ANOTHER: "wait for the end of the other lease, or take the wheel by --takeover",
+    commands.NO_PICTURE: "drive it on the page, by its picture; --blind moves it without",
 }
 
 
@@ -333,16 +335,19 @@ def sending(
     valid_ms: int = VALID_MS,
     seconds: float = ANSWER_S,
     takeover: bool = False,
+    blind: bool = False,
     on_offline: Callable[[str], None] = lambda _text: None,
 ) -> Generator[None, None, Sent]:
     """Send a command and wait for the robot's answer, at most ``seconds``: it yields between two looks.
 
     Every call is an operator's session of its own. While another one drives, its motion is refused, unless it
-    says ``takeover``. ``lease_ms`` is how long the robot may move. A robot that is not connected is hardly
-    waited for; ``on_offline`` learns it at once. Raises `UsageError` for an unknown robot and for an invalid
-    command.
+    says ``takeover``. ``lease_ms`` is how long the robot may move; one with video only if it is said to move
+    ``blind``. A robot that is not connected is hardly waited for; ``on_offline`` learns it at once. Raises
+    `UsageError` for an unknown robot and for an invalid command, before it is sent.
     """
     shadow = Shadow(cloud, robot)
+    if lease_ms is not None and not blind:
+        check_blind(robot, shadow.read().reported.video)
     now_us = time.time_ns() // 1000
     try:
         topic = build_topic(CMD, robot, name, cloud.namespace)
@@ -357,6 +362,7 @@ def sending(
             answer=True,
             by=operator(),
             takeover=takeover,
+            blind=blind,
         )
         payload = commands.encode_command(command)
     except ContractError as error:
@@ -369,6 +375,15 @@ def sending(
         lambda state: outcome(state, name, command.session, command.seq), seconds
     )
     return Sent(command, answer, offline if answer is None else "")
+
+
+def check_blind(robot: str, video: VideoTerms | None) -> None:
+    """Raise `UsageError` if a robot is to be moved from here that takes no motion without its picture."""
+    if video is not None:
+        raise UsageError(
+            f"{robot} has a camera, and takes no motion without its picture; nothing is sent. Drive it on "
+            "the page, or move it blind (--blind), which is recorded"
+        )
 
 
 def _offline(cloud: Cloud, robot: str) -> str:

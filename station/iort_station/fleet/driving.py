@@ -140,6 +140,11 @@ class Driver:
             return None
         return max(0, now_us + offset_us - self._taken_us)
 
+    @property
+    def unsighted(self) -> bool:
+        """Whether a robot with video is driven without its picture."""
+        return self.blind and self._picture_us is not None
+
     def see(self, frame: int | None, age_us: int, now_us: int) -> None:
         """Take the newest picture on the screen, and its age; None once no picture is shown."""
         self._frame, self._captured_us = frame, now_us - age_us
@@ -324,7 +329,7 @@ class Driver:
             takeover=self.takeover,
             ends=ends,
             frame=None if self._picture_us is None else self._frame,
-            blind=self.blind and self._picture_us is not None,
+            blind=self.unsighted,
         )
 
     def _cloud_us(self, now_us: int) -> int:

@@ -8,7 +8,7 @@ import time
 
 from iort_contract.cloud import DRIVER
 from iort_contract.limits import LIVE_MAX_RATE_HZ, ContractError
-from iort_contract.messages.commands import DRIVE_RATE_HZ, DriveLimits, encode_command
+from iort_contract.messages.commands import DRIVE_RATE_HZ, encode_command
 from iort_contract.messages.live import (
     VIEW_LEASE_MS,
     VIEW_RENEW_S,
@@ -22,6 +22,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry, stopping
 from iort_station.fleet.broker import Broker
+from iort_station.fleet.control import check_blind, operator
 from iort_station.fleet.driving import Driver, Stick
 from iort_station.fleet.roles import Role
 
@@ -33,9 +34,12 @@ def monotonic_us() -> int:
     return time.monotonic_ns() // 1000
 
 
-def limits_of(cloud: Cloud, robot: str) -> DriveLimits:
-    """The limits of a robot that a stick can drive; raises `StationError` for one that cannot be driven, or
-    that is stopped."""
+def driver_of(cloud: Cloud, robot: str, *, by: str | None, top_mps: float, blind: bool) -> Driver:
+    """A driver of a robot that a stick can drive: ``by`` or else this computer's user.
+
+    Raises `StationError` for a robot that cannot be driven or that is stopped, and `UsageError` for one with
+    video, whose picture nobody sees here, unless it is driven ``blind``.
+    """
     registry.get(cloud, robot)
     found = stopping.motion(cloud, [robot])[robot]
     if found.drive is None:
@@ -44,7 +48,15 @@ def limits_of(cloud: Cloud, robot: str) -> DriveLimits:
         )
     if found.asked:
         raise StationError(f"{robot} is stopped: `iort stop {robot} --release` lets it move again")
-    return found.drive
+    if not blind:
+        check_blind(robot, found.video)
+    return Driver(
+        found.drive,
+        by or operator(),
+        min(top_mps, found.drive.max_speed_mps),
+        picture_us=None if found.video is None else found.video.max_age_ms * 1000,
+        blind=blind,
+    )
 
 
 class Seat:

@@ -108,7 +108,8 @@ def downloads(cloud: Cloud) -> dict[str, Download]:
 
 def send(cloud: Cloud, request: Mapping[str, str]) -> Generator[None, None, SendAnswer]:
     """Send the ``command`` of this name with its ``message`` to ``robot``, for ``lease_ms`` if it moves;
-    ``takeover`` takes the wheel from whoever drives. It yields while it waits for the robot."""
+    ``takeover`` takes the wheel from whoever drives, ``blind`` moves one with video without its picture. It
+    yields while it waits for the robot."""
     try:
         message = json.loads(text(request, "message"))
     except (ValueError, RecursionError) as error:
@@ -118,8 +119,10 @@ def send(cloud: Cloud, request: Mapping[str, str]) -> Generator[None, None, Send
     lease_ms = whole(request, "lease_ms", 1, MAX_LEASE_MS) if request.get("lease_ms") else None
     began = time.monotonic()
     robot, name = text(request, "robot"), text(request, "command")
-    takeover = request.get("takeover") == "true"
-    sent = yield from control.sending(cloud, robot, name, message, lease_ms=lease_ms, takeover=takeover)
+    takeover, blind = (request.get(word) == "true" for word in ("takeover", "blind"))
+    sent = yield from control.sending(
+        cloud, robot, name, message, lease_ms=lease_ms, takeover=takeover, blind=blind
+    )
     after_ms = round((time.monotonic() - began) * 1000)
     if sent.outcome is None:
         return {"accepted": None, "reason": sent.offline, "after_ms": after_ms}

@@ -79,7 +79,9 @@ def test_a_command_is_sent_and_its_answer_shown(open_page, invite, robot, car):
     robot.answer = {"accepted": False, "reason": "clock_offset_unknown", "after_ms": 300}
     page.get_by_role("button", name="Stop").click()
     until(lambda: said.inner_text() == "drive rejected: clock offset unknown", "the rejection")
+    # Nobody needs a picture to let it stand.
     assert robot.sent[1]["message"] == {"drive": {"speed": 0, "steering_angle": 0}}
+    assert robot.sent[1]["blind"] == "true"
     robot.answer = {"accepted": None, "reason": "", "after_ms": 10_000}
     page.select_option("[name=type]", "JSON")
     page.fill("[name=message]", '{"data": true')
@@ -91,9 +93,11 @@ def test_a_command_is_sent_and_its_answer_shown(open_page, invite, robot, car):
     page.get_by_role("button", name="Send").click()
     until(lambda: "No answer within 10 s" in said.inner_text(), "the end of the wait")
     assert robot.sent[2] == {"robot": "car-1", "command": "horn", "lease_ms": "", "message": {"data": True}}
+    page.get_by_label("Blind").check()
     page.fill("[name=command]", "nothing")
     page.get_by_role("button", name="Send").click()
     until(lambda: said.inner_text() == "there is no such command", "the server's refusal")
+    assert robot.sent[3]["blind"] == "true"
 
 
 def test_a_setting_is_checked_changed_and_reset(open_page, invite, robot, car):

@@ -19,14 +19,12 @@ from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ
 from iort_station import kept
 from iort_station.cli import options
 from iort_station.cli.console import Lines, tell
-from iort_station.cli.options import AsJson, LiveWay, Token, When, argument, examples, option, ranged
+from iort_station.cli.options import AsJson, Blind, LiveWay, Token, When, argument, examples, option, ranged
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import registry
-from iort_station.fleet.control import operator
-from iort_station.fleet.driving import Driver
 from iort_station.fleet.roles import transport
-from iort_station.fleet.seat import Seat, limits_of
+from iort_station.fleet.seat import Seat, driver_of
 from iort_station.times import iso_s
 from iort_station.upkeep.snapshot import VERSION
 
@@ -74,6 +72,7 @@ def bridge(
         float, option("The top speed of --drive in m/s; at most the car's own limit.", min=0.01)
     ] = 1.0,
     by: Annotated[str | None, option("Who drives, as others see it. Default: the user.")] = None,
+    blind: Blind = False,
     live: LiveWay = None,
     token: Token = "",
     as_json: AsJson = False,
@@ -103,7 +102,10 @@ def bridge(
                 raise UsageError("--drive needs the name of one robot")
             names = names or _every_robot(cloud)
             what = f"{', '.join(names)}, live"
-            seat = _seat(cloud, names[0], max_speed, by) if drive else None
+            seat = None
+            if drive:
+                driver = driver_of(cloud, names[0], by=by, top_mps=max_speed, blind=blind)
+                seat = Seat(cloud, names[0], driver)
             way = live or transport(cloud)
             lanes = serving(cloud, names, access, way=way, rate_hz=rate, token=token, seat=seat)
             served = stack.enter_context(lanes)
@@ -203,11 +205,6 @@ def _tls(certificate: Path | None) -> ssl.SSLContext | None:
     except (OSError, ssl.SSLError) as error:
         raise StationError(f"{certificate} must be a PEM file with key and certificate: {error}") from error
     return context
-
-
-def _seat(cloud: Cloud, robot: str, max_speed: float, by: str | None) -> Seat:
-    limits = limits_of(cloud, robot)
-    return Seat(cloud, robot, Driver(limits, by or operator(), min(max_speed, limits.max_speed_mps)))
 
 
 def _tell(served: Served, what: str, *, as_json: bool) -> None:

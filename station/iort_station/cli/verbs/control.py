@@ -23,7 +23,7 @@ from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
 from iort_station.cli import options
 from iort_station.cli.console import Lines, errors, out, print_json, tell
-from iort_station.cli.options import AsJson, CloudOptions, Robot, argument, examples, option, say
+from iort_station.cli.options import AsJson, Blind, CloudOptions, Robot, argument, examples, option, say
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import control, registry, stopping
@@ -53,6 +53,7 @@ def send(
     takeover: Annotated[
         bool, option("Take the wheel from whoever drives; refused otherwise.", "--takeover")
     ] = False,
+    blind: Blind = False,
     as_json: AsJson = False,
 ) -> None:
     """Send a command and print the robot's answer.
@@ -72,6 +73,7 @@ def send(
             valid_ms=valid_ms,
             seconds=seconds,
             takeover=takeover,
+            blind=blind,
             on_offline=say,
         )
     if as_json:

@@ -22,13 +22,12 @@ from iort_contract.messages.commands import (
     DRIVE_MAX_RTT_MS,
 )
 from iort_station.cli.console import out
-from iort_station.cli.options import Robot, examples, option
+from iort_station.cli.options import Blind, Robot, examples, option
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet import stopping
-from iort_station.fleet.control import operator
 from iort_station.fleet.driving import Driver, Phase, Stick
-from iort_station.fleet.seat import TICK_US, Seat, limits_of, monotonic_us
+from iort_station.fleet.seat import TICK_US, Seat, driver_of, monotonic_us
 
 # The keys of `iort drive` as a stick with a dead man's switch.
 #
@@ -133,18 +132,19 @@ def drive(
         float | None, option("The top speed in m/s; at most the car's own limit.", min=0.01)
     ] = None,
     by: Annotated[str | None, option("Who drives, as others see it. Default: the user.")] = None,
+    blind: Blind = False,
 ) -> None:
     """Drive a car by the keys of this terminal, until q.
 
     The car moves while a key is held: by w a s d or the arrows. It stops when the key's repetitions stop, and
-    when round trip or newest sample are too old. It needs the right to drive (docs/how-to/drive.md).
+    when round trip or newest sample are too old. It needs the right to drive (docs/how-to/drive.md). A
+    terminal shows no picture: a car with a camera is driven so with --blind alone.
     """
     if not (sys.stdin.isatty() and out.is_terminal):
         raise UsageError("iort drive needs a terminal with a keyboard")
     cloud = context.obj.cloud()
-    limits = limits_of(cloud, robot)
-    top_mps = min(max_speed or _USUAL_MPS, limits.max_speed_mps)
-    seat = _Seat(cloud, robot, Driver(limits, by or operator(), top_mps))
+    driver = driver_of(cloud, robot, by=by, top_mps=max_speed or _USUAL_MPS, blind=blind)
+    seat = _Seat(cloud, robot, driver)
     with seat.broker, _raw_keys(), Live(console=out, auto_refresh=False, transient=True) as live:
         try:
             seat.run(live)
@@ -236,6 +236,8 @@ class _Seat(Seat):
         rows.add_row("steering", f"{steering} rad")
         rows.add_row("round trip", _ms(driver.rtt_us, DRIVE_MAX_RTT_MS))
         rows.add_row("newest sample", _ms(driver.age_us(now_us), DRIVE_MAX_AGE_MS))
+        if driver.unsighted:
+            rows.add_row("picture", Text("none: you drive blind", style="yellow"))
         if self._stop_asked:
             confirms = f"asked for; `iort stop {self._robot}` tells whether the car has confirmed it"
             rows.add_row("emergency stop", Text(confirms, style="red"))

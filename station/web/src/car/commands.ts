@@ -53,6 +53,7 @@ export class Commands {
     max: String(MAX_LEASE_MS),
     step: "1",
   });
+  private readonly blind = el("input", { type: "checkbox", name: "blind" });
   private readonly json = el(
     "textarea",
     { name: "message", rows: "3", spellcheck: "false", "aria-label": "ROS message as JSON" },
@@ -61,7 +62,8 @@ export class Commands {
   private readonly drive: HTMLElement;
   private readonly stop = button(
     "Stop",
-    () => void this.send(MESSAGES[this.type.value]!.of(0, 0), String(LEASE_MS)),
+    // Nobody needs a picture to let it stand.
+    () => void this.send(MESSAGES[this.type.value]!.of(0, 0), String(LEASE_MS), true),
     { class: "tool stop" },
   );
   private readonly said = el("p", { class: "note said", role: "status" });
@@ -83,7 +85,10 @@ export class Commands {
       pair(el("label", {}, "Command", this.command), el("label", {}, "Message", this.type)),
       this.drive,
       this.json,
-      pair(el("label", { title: "How long the car may move, from now" }, "For", this.lease, unit("ms"))),
+      pair(
+        el("label", { title: "How long the car may move, from now" }, "For", this.lease, unit("ms")),
+        el("label", { title: "Move a car with a camera without its picture" }, this.blind, "Blind"),
+      ),
       pair(el("button", { type: "submit", class: "tool primary" }, "Send"), this.stop),
       this.said,
     );
@@ -97,6 +102,7 @@ export class Commands {
   of(robot: string): void {
     if (robot === this.robot) return;
     this.robot = robot;
+    this.blind.checked = false;
     this.said.textContent = "";
   }
 
@@ -115,13 +121,13 @@ export class Commands {
       const message = known
         ? known.of(this.speed.valueAsNumber, this.turn.valueAsNumber)
         : (JSON.parse(this.json.value) as Message);
-      void this.send(message, this.lease.value);
+      void this.send(message, this.lease.value, this.blind.checked);
     } catch (error) {
       this.say("bad", `The message must be JSON: ${error instanceof Error ? error.message : String(error)}`);
     }
   }
 
-  private async send(message: Message, lease_ms: string): Promise<void> {
+  private async send(message: Message, lease_ms: string, blind: boolean): Promise<void> {
     const [robot, command] = [this.robot, this.command.value];
     keep("car.command", command);
     keep("car.message", this.type.value);
@@ -132,6 +138,7 @@ export class Commands {
       command,
       message: JSON.stringify(message),
       lease_ms,
+      ...(blind ? { blind: "true" } : {}),
     }).then(
       (answer) => outcomeOf(command, answer),
       (error: unknown) => ["bad", words(error)] as const,

@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from iort_contract.messages.commands import DRIVEN_BY_ANOTHER, NO_LEASE, Command, decode_command
+from iort_contract.messages.commands import DRIVEN_BY_ANOTHER, NO_LEASE, NO_PICTURE, Command, decode_command
 from iort_contract.messages.shadow import OverShare, Reported, decode_desired, decode_reported
+from iort_contract.messages.video import VideoTerms, encode_terms
 from iort_station.cli.verbs.control import commands
-from iort_station.errors import StationError
+from iort_station.errors import StationError, UsageError
 from iort_station.fleet.control import State, _check_clock, outcome, over_share, settled, slept
 from iort_station.page import answers
 
@@ -27,8 +28,8 @@ class Cloud:
         class ResourceNotFoundException(Exception):
             """There is no shadow."""
 
-    def __init__(self, outcome: str | None = "accepted", *, online: bool = True) -> None:
-        self.outcome, self.online = outcome, online
+    def __init__(self, outcome: str | None = "accepted", *, online: bool = True, video: Any = None) -> None:
+        self.outcome, self.online, self.video = outcome, online, video or {}
         self.sent: list[Command] = []
 
     def client(self, _service: str) -> Cloud:
@@ -49,10 +50,11 @@ class Cloud:
 
     def get_thing_shadow(self, **_asked: Any) -> dict[str, Any]:
         said = {}
-        if self.outcome is not None:
+        if self.outcome is not None and self.sent:
             (*_, one) = self.sent
             said = {"drive": {"session": one.session, "seq": one.seq, "outcome": self.outcome}}
-        return {"payload": io.BytesIO(json.dumps({"state": {"reported": {"commands": said}}}).encode())}
+        reported = {"commands": said, "video": self.video}
+        return {"payload": io.BytesIO(json.dumps({"state": {"reported": reported}}).encode())}
 
 
 def send(cloud: Cloud, *options: str) -> Any:
@@ -74,7 +76,44 @@ def test_the_wheel_is_taken_only_if_that_is_asked_for(options: tuple[str, ...], 
     assert [command.takeover for command in cloud.sent] == [takeover, takeover]
 
 
-@pytest.mark.parametrize(("outcome", "advice"), [(NO_LEASE, "--lease-ms"), (DRIVEN_BY_ANOTHER, "--takeover")])
+VIDEO = encode_terms(VideoTerms(640, 480, 15.0))
+MOVES = ("--lease-ms", "500")
+
+
+@pytest.mark.parametrize(
+    ("video", "options", "blind"),
+    [
+        (VIDEO, (*MOVES, "--blind"), True),
+        (VIDEO, (), False),  # what moves nothing needs no picture
+        ({}, MOVES, False),
+        ({}, (*MOVES, "--blind"), True),
+    ],
+)
+def test_a_car_with_a_camera_is_moved_from_a_terminal_blind(
+    video: Any, options: tuple[str, ...], blind: bool
+) -> None:
+    cloud = Cloud(video=video)
+    assert send(cloud, *options).exit_code == 0
+    assert [(command.blind, command.frame) for command in cloud.sent] == [(blind, None)]
+
+
+def test_without_that_nothing_is_sent_and_the_refusal_says_what_to_do() -> None:
+    cloud = Cloud(video=VIDEO)
+    done = send(cloud, *MOVES)
+    assert isinstance(done.exception, UsageError)
+    assert "Drive it on the page, or move it blind (--blind)" in str(done.exception)
+    asked = {"robot": "car7", "command": "drive", "message": "{}", "lease_ms": "500"}
+    with pytest.raises(UsageError, match="takes no motion without its picture"):
+        slept(answers.send(cloud, asked))  # type: ignore[arg-type]  # a fake
+    assert cloud.sent == []
+    assert slept(answers.send(cloud, {**asked, "blind": "true"}))["accepted"]  # type: ignore[arg-type]  # a fake
+    assert [command.blind for command in cloud.sent] == [True]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "advice"),
+    [(NO_LEASE, "--lease-ms"), (DRIVEN_BY_ANOTHER, "--takeover"), (NO_PICTURE, "--blind")],
+)
 def test_a_rejection_says_what_helps(outcome: str, advice: str) -> None:
     done = send(Cloud(f"{outcome.replace('_', ' ')}, sent 0.031 s ago, by its own clock"))
     assert advice in str(done.exception)

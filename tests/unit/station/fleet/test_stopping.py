@@ -17,9 +17,11 @@ from typer.testing import CliRunner
 from iort_agent.control.shadow import _merged
 from iort_contract.messages.commands import NO_MOTION, DriveLimits, encode_limits
 from iort_contract.messages.shadow import Pressed, encode_stop
+from iort_contract.messages.video import VideoTerms, encode_terms
 from iort_station.cli.verbs.control import commands
 from iort_station.cli.verbs.robots import commands as robots
-from iort_station.errors import StationError
+from iort_station.errors import StationError, UsageError
+from iort_station.fleet.seat import driver_of
 from iort_station.operations.alarms import user
 from iort_station.page import answers, motion
 from testkit.waiting import GUARD_S
@@ -112,8 +114,30 @@ def test_a_stop_counts_once_the_robot_has_confirmed_it(cloud):
     told = motion.fleet(cloud).motion({"robot": "car7"})["robots"]["car7"]
     assert (told["asked"], told["stopped"]) == (True, True)
     assert told["drive"] == vars(LIMITS)
+    assert told["video"] is None
     told = motion.fleet(cloud).stop({"robot": "car7", "stopped": "false", **NOW})["robots"]["car7"]
     assert (told["asked"], told["stopped"]) == (False, True)
+
+
+def test_a_robot_with_a_camera_tells_how_old_a_picture_may_be_and_is_driven_from_a_terminal_blind(cloud):
+    terms = VideoTerms(640, 480, 15.0, 300)
+    cloud.states["car7"]["reported"]["video"] = encode_terms(terms)
+    assert motion.fleet(cloud).motion({"robot": "car7"})["robots"]["car7"]["video"] == vars(terms)
+    with pytest.raises(UsageError, match=r"takes no motion without its picture.*\(--blind\)"):
+        driver_of(cloud, "car7", by="ada", top_mps=1.0, blind=False)
+    assert cloud.changed == []
+    driver = driver_of(cloud, "car7", by="ada", top_mps=9.0, blind=True)
+    assert (driver.by, driver.top_mps, driver.unsighted) == ("ada", 2.0, True)
+
+
+def test_a_robot_without_a_camera_is_driven_as_ever(cloud):
+    for blind in (False, True):
+        assert not driver_of(cloud, "car7", by="ada", top_mps=1.0, blind=blind).unsighted
+    cloud.states["car7"]["desired"] = {"motion": {"stopped": True}}
+    with pytest.raises(StationError, match="iort stop car7 --release"):
+        driver_of(cloud, "car7", by="ada", top_mps=1.0, blind=False)
+    with pytest.raises(StationError, match=r"no downlink\.drive"):
+        driver_of(cloud, "car8", by="ada", top_mps=1.0, blind=True)
 
 
 def test_a_stop_of_the_fleet_is_seen_at_once(cloud):
