@@ -87,6 +87,7 @@ class Kind(NamedTuple):
 THREADS = {
     "asks": Kind(),
     "callbacks": Kind(longest_s=1.0),
+    "camera": Kind(longest_s=2.0),
     # It publishes the stops.
     "downlink": Kind(longest_s=FIRST_S),
     "guard": Kind(longest_s=1.0),

@@ -36,6 +36,9 @@ class Graph(Protocol):
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages, of any type, in another thread."""
 
+    def unsubscribe(self, topic: str, handler: OnBytes) -> None:
+        """Stop receiving what `subscribe` began."""
+
     def offer(self, service: str, handler: OnTrigger) -> None:
         """Answer calls of a service of the ROS' type Trigger, of std_srvs, each in a thread of its own."""
 

@@ -45,6 +45,9 @@ from iort_agent.runtime import Runtime
 from iort_agent.sources.sim import SimConfig
 from iort_agent.spool.sqlite import SqliteSpool
 from iort_agent.status import StatusServer, fetch
+from iort_agent.video import Frame, Pictures
+from iort_agent.video.camera import Camera
+from iort_agent.video.capture import Capture
 from iort_contract.messages.batch import decode_batch
 from testkit.agent import Loopback, ManualClock, Published
 from tests.unit.agent.control import test_guard
@@ -168,6 +171,31 @@ def asks(kind: str, _folder: Path, _patch: pytest.MonkeyPatch) -> None:
         rig.close()
 
 
+def camera(kind: str, _folder: Path, _patch: pytest.MonkeyPatch) -> None:
+    """The camera is opened again."""
+
+    class Eye(Camera):
+        def open(self) -> None:
+            if not alarms(kind):
+                surprise()
+
+        def read(self, number: int, stop: threading.Event) -> Frame | None:
+            return None if stop.wait(0.001) else Frame(number, 0, float(number), Mock())
+
+        def close(self) -> None:
+            pass
+
+    taken = threading.Event()
+    capture = Capture(Eye, SystemClock(), take=lambda _: taken.set(), pictures=Pictures())
+    capture.start()
+    try:
+        capture.want(wanted=True)
+        assert taken.wait(SOON_S)
+        assert alarms(kind)[0].endswith(WHY)
+    finally:
+        capture.close()
+
+
 def guard(_kind: str, folder: Path, patch: pytest.MonkeyPatch) -> None:
     """It still notices that the agent is back, and ends."""
     node, looks = test_guard.Node(), iter([surprise, frozenset, *[lambda: frozenset(["back"])] * 3])
@@ -254,6 +282,7 @@ SCENARIOS: dict[str, Scenario] = {
         in_the_whole_agent,
     ),
     "asks": asks,
+    "camera": camera,
     "guard": guard,
     "ros1 node": ros1_node,
     "ros2 node": ros2_node,

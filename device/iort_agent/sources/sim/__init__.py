@@ -15,7 +15,7 @@ from iort_agent.ros import Graph, OnBytes
 from iort_agent.ros.json_message import decode
 from iort_agent.ros.ros1_types import OnTrigger
 from iort_agent.sources import Emit, Source, SourceConfig
-from iort_agent.sources.sim.driver import HALL, Circuit, Wish, wrapped
+from iort_agent.sources.sim.driver import HALL, Circuit, Pose, Wish, wrapped
 from iort_agent.sources.sim.faults import FaultConfig, fault_rule
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.streams import POSE_STREAM
@@ -168,6 +168,9 @@ class SimGraph(Graph):
     def subscribe(self, topic: str, handler: OnBytes) -> None:  # noqa: ARG002 - as the graph has it
         raise SourceError(f"a simulated car publishes no ROS topics, so it cannot share {topic}")
 
+    def unsubscribe(self, topic: str, handler: OnBytes) -> None:
+        pass
+
     def offer(self, service: str, handler: OnTrigger) -> None:  # noqa: ARG002 - as the graph has it
         raise SourceError(f"a simulated car has no ROS nodes, so nobody could call {service}")
 
@@ -238,13 +241,15 @@ class SimSource(Source):
     intermittent CAN loses. The car obeys the commands that ``graph`` takes."""
 
     def __init__(self, config: SimConfig, clock: Clock) -> None:
-        self._config = config
+        self.config = config
         self._clock = clock
         self.graph = SimGraph(clock)
+        # Where the car is, for any thread; None before it drives.
+        self.pose: Pose | None = None
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Drive until the duration is over or ``stop`` is set."""
-        config = self._config
+        config = self.config
         vehicle = Vehicle(
             config.vehicle, config.seed, Circuit(config.track), faults=config.faults, pace=config.pace
         )
@@ -256,6 +261,7 @@ class SimSource(Source):
         while (total is None or done < total) and pace.until(done / config.rate_hz):
             for _ in range(steps):
                 vehicle.step(1 / config.rate_hz / steps, self.graph.wish())
+            self.pose = vehicle.pose
             now_us = self._clock.now_us()
             if not vehicle.damage.silent:
                 emit(config.stream, now_us, measured.vesc())

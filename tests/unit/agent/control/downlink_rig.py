@@ -145,6 +145,9 @@ class FakeGraph:
     def subscribe(self, topic: str, handler: Callable[[Mapping[str, str], bytes], None]) -> None:
         self._handlers[topic] = handler
 
+    def unsubscribe(self, topic: str, handler: Callable[[Mapping[str, str], bytes], None]) -> None:
+        assert self._handlers.pop(topic) == handler
+
     def hear(self, topic: str, kind: str, data: bytes) -> None:
         if self.ros == 2:
             data = converted(kind, data, 2)
