@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo up down up-service up-password test test-all test-heavy test-fast test-oldest mutants check setup prove-mixed prove-ros2 prove-recorder prove-lerobot wheels wheelhouse release bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo up down up-service up-password test test-all test-heavy test-fast test-oldest mutants check setup prove-mixed prove-ros2 prove-recorder prove-video prove-lerobot wheels wheelhouse release bench screenshots verify-aws docs-parts docs docs-serve layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z0-9-]+:.*## ' Makefile | sed -E 's/^([a-z0-9-]+):.*## /\1\t/' | expand -t 14
@@ -85,6 +85,10 @@ prove-ros2: setup ## drive a robot of ROS 2 beside ros2 bag record: DURATION=60 
 
 prove-recorder: setup ## prove that incidents are complete, in each ROS that is here: DURATION=60, 600 for five minutes without a broker
 	@IORT_RECORDER_S=$(or $(DURATION),60) $(BIN)/python -m pytest -rA tests/ros/recorder
+
+prove-video: setup ## prove what a driver saw, in Chromium and aiortc, on bad networks too: DURATION=60, 600 for fifty tries of each failure, REPORT=report.json
+	@IORT_VIDEO_S=$(or $(DURATION),60) IORT_VIDEO_REPORT=$(or $(REPORT),build/prove-video.json) \
+		$(BIN)/python -m pytest -rA tests/video/test_proof.py
 
 prove-lerobot: setup ## let LeRobot itself read a dataset that `iort export` wrote: it installs 8 GB into build/
 	@$(PYTHON) -m venv build/lerobot && build/lerobot/bin/pip install --quiet lerobot==0.4.4

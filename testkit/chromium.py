@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,17 +65,20 @@ _START_S = 30.0
 
 
 class Tabs:
-    """Runs from `__enter__` to `__exit__`; ``url`` is where playwright connects."""
+    """Runs from `__enter__` to `__exit__`; ``url`` is where playwright connects. ``within`` is what a command
+    begins with to run on another machine, whose ``url`` it is then."""
 
-    def __init__(self, folder: Path) -> None:
-        self._profile = folder / "chromium"
+    def __init__(self, folder: Path, *, within: Sequence[str] = ()) -> None:
+        self._profile, self._within = folder / "chromium", within
         self._process: subprocess.Popen[bytes]
         self.url = ""
 
     def __enter__(self) -> Self:
         own = ("--headless=new", "--remote-debugging-port=0", f"--user-data-dir={self._profile}")
         self._process = subprocess.Popen(
-            [_program(), *FLAGS, *own, "about:blank"], stderr=subprocess.DEVNULL, start_new_session=True
+            [*self._within, _program(), *FLAGS, *own, "about:blank"],
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
         port = self._profile / "DevToolsActivePort"
         if not reached(lambda: port.exists() and port.read_text(), within_s=_START_S):

@@ -7,6 +7,7 @@ import socket
 import struct
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from typing_extensions import Self
@@ -16,14 +17,23 @@ _CHUNK = 65536
 
 
 class Proxy:
-    """Listens on a port of its own and forwards to the target.
+    """Listens on a port of its own, or at ``listener``, and forwards to the target. The sockets that reach it
+    come from ``dial`` if that is given: those of another machine.
 
     ``mode`` is `PASS`, `REFUSE` (reset every connection) or `FREEZE` (keep connections open, pass no byte).
     ``latency_s`` delays every byte, each way. ``attempts`` holds the monotonic time of every attempt.
     """
 
-    def __init__(self, host: str, port: int, *, latency_s: float = 0.0) -> None:
-        self._target = (host, port)
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        latency_s: float = 0.0,
+        listener: socket.socket | None = None,
+        dial: Callable[[], socket.socket] | None = None,
+    ) -> None:
+        self._target, self._listener, self._dial = (host, port), listener, dial
         self.latency_s = latency_s
         self.attempts: list[float] = []
         self._mode = PASS
@@ -74,7 +84,10 @@ class Proxy:
 
     async def _start(self) -> None:
         self._flowing.set()
-        self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
+        if self._listener is None:
+            self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
+        else:
+            self._server = await asyncio.start_server(self._accept, sock=self._listener)
         self.port = self._server.sockets[0].getsockname()[1]
 
     async def _stop(self) -> None:
@@ -119,7 +132,7 @@ class Proxy:
         out: asyncio.StreamWriter | None = None
         try:
             await self._flowing.wait()
-            back, out = await asyncio.open_connection(*self._target)
+            back, out = await self._connect()
             self._open.add(out)
             await asyncio.wait(
                 [asyncio.create_task(self._pump(reader, out)), asyncio.create_task(self._pump(back, writer))],
@@ -132,6 +145,14 @@ class Proxy:
                 if one is not None:
                     self._open.discard(one)
                     _abort(one)
+
+    async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        if self._dial is None:
+            return await asyncio.open_connection(*self._target)
+        connection = await self._loop.run_in_executor(None, self._dial)
+        connection.setblocking(False)
+        await self._loop.sock_connect(connection, self._target)
+        return await asyncio.open_connection(sock=connection)
 
     async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         queue: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()

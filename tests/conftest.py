@@ -50,6 +50,8 @@ GROUPS = {
     "tests/local/network/": "cloud of the robots",
     "tests/local/identity/": "cloud of the robots",
     "tests/local/robots/": "cloud of the robots",
+    # All tests of the proof look at one drive of minutes.
+    "tests/video/": "cloud of the robots",
     "tests/web/": "",
     "tests/stacks/": "app",
     "tests/unit/functions/test_admit.py": "app",

@@ -1,0 +1,95 @@
+"""The judgement of the proof, by drives whose verdict is known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tests.video.account import Motion, Shown, again_s, ages_ms, judge, live_share, longest_gap_ms, motions
+
+LIMIT_MS = 500
+# Pictures 1 to 20, ten a second, each on the screen 80 ms after its capture.
+CAPTURED = {number: number * 100_000 for number in range(1, 21)}
+SHOWN = [Shown(at_us + 80_000, number) for number, at_us in CAPTURED.items()]
+EVER = (0, 10_000_000)
+
+
+def command(at_us: int, frame: int | None = None, **change: object) -> Motion:
+    age_ms = None if frame is None else (at_us - CAPTURED[frame]) / 1000
+    return Motion(at_us, 1, "accepted", frame, age_ms, blind=False, drives=True)._replace(**change)
+
+
+def wrong(*commands: Motion, slack_ms: float = 0.0) -> tuple[str, ...]:
+    return judge(commands, SHOWN, CAPTURED, LIMIT_MS, EVER, slack_ms=slack_ms).wrong
+
+
+def test_a_command_by_the_newest_picture_is_right() -> None:
+    assert wrong(command(1_100_000, 10), command(2_500_000, 20)) == ()
+
+
+@pytest.mark.parametrize(
+    ("late", "why"),
+    [
+        (command(2_501_000, 20), "its picture was 501 ms old"),
+        (command(2_700_000, 20, frame_age_ms=10.0), "the newest on the screen, 20, was 700.0 ms old"),
+        (command(1_100_000), "names picture None"),
+        (command(1_100_000, 10, frame_age_ms=None), "names picture 10"),
+        (command(1_100_000, 10, blind=True), "blind"),
+        (command(1_050_000, 10), "picture 10 was not on the screen"),
+    ],
+)
+def test_every_wrong_command_is_told(late: Motion, why: str) -> None:
+    (told,) = wrong(late)
+    assert why in told
+
+
+def test_a_refused_command_and_one_that_ends_are_not_wrong() -> None:
+    refused = command(4_000_000, 20, outcome="picture_late")
+    verdict = judge([refused, command(4_000_000, drives=False)], SHOWN, CAPTURED, LIMIT_MS, EVER)
+    assert (verdict.passed, verdict.refused, verdict.wrong) == (0, 2, ())
+
+
+def test_the_browsers_clock_may_be_a_little_off() -> None:
+    assert wrong(command(1_075_000, 10), slack_ms=5) == ()
+
+
+def test_only_the_commands_of_the_time_count() -> None:
+    verdict = judge([command(9_000_000, 20)], SHOWN, CAPTURED, LIMIT_MS, (0, 5_000_000))
+    assert verdict.passed == 0
+
+
+def test_the_age_is_that_on_the_screen() -> None:
+    assert set(ages_ms([*SHOWN, Shown(5_000_000, None), Shown(5_000_000, 99)], CAPTURED)) == {80.0}
+
+
+def test_a_picture_is_live_until_it_is_late() -> None:
+    # The last one comes at 2.08 s and is late at 2.5 s.
+    assert live_share(SHOWN, CAPTURED, (2_080_000, 2_920_000), LIMIT_MS) == pytest.approx(0.5)
+    assert live_share(SHOWN, CAPTURED, (500_000, 1_500_000), LIMIT_MS) == pytest.approx(1.0)
+
+
+def test_pictures_are_back_when_a_new_one_is_not_late() -> None:
+    late = [Shown(3_000_000, 18), Shown(3_100_000, 19)]
+    assert again_s(late, CAPTURED, 1_800_000, LIMIT_MS) is None
+    assert again_s([*late, *SHOWN], CAPTURED, 1_850_000, LIMIT_MS) == pytest.approx(0.13)
+
+
+def test_the_longest_gap_reaches_to_the_ends() -> None:
+    assert longest_gap_ms(SHOWN, (0, 5_000_000)) == pytest.approx(2920)
+
+
+def test_nulls_of_a_query_are_none() -> None:
+    (one,) = motions(
+        [5],
+        {
+            "seq": [3.0],
+            "outcome": ["accepted"],
+            "frame": [math.nan],
+            "frame_age_ms": [math.nan],
+            "blind": [False],
+            "driver": [None],
+        },
+    )
+    assert one == Motion(5, 3, "accepted", None, None, blind=False, drives=False)
+    assert not one.passed
