@@ -44,6 +44,7 @@ STAGES: dict[str, dict[str, Any]] = {
     "prod": {
         "stage": "prod",
         "drivers": True,
+        "turn": True,
         "customer_key": True,
         "budget_usd": 50,
         "alarm_email": "lab@example.org",

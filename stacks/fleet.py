@@ -9,6 +9,7 @@ from aws_cdk import App, CfnOutput, Duration, Stack
 from aws_cdk import aws_cognito as cognito
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
+from aws_cdk import aws_kinesisvideo as kinesisvideo
 from aws_cdk import aws_lambda as lambda_
 
 from iort_contract.catalog.environments import RegistryEnvironment
@@ -61,7 +62,7 @@ def public_identity(stack: PlatformStack) -> None:
     CfnOutput(stack, "PublicRobots", value=",".join(stack.settings.site_robots))
 
 
-def _person(stack: PlatformStack, name: str, *, commands: bool = False) -> None:
+def _person(stack: PlatformStack, name: str, *, commands: bool = False) -> iam.Role:
     """A role that people and programs of this account may assume, if their own policy says so.
 
     Whoever looks hears pictures, and the answers to a viewer whose name it knows: in MQTT a wildcard is a
@@ -77,6 +78,17 @@ def _person(stack: PlatformStack, name: str, *, commands: bool = False) -> None:
     sent = [f"{VIEW}/{namespace}/*/{name}" for name in (LEASE, VIDEO)]
     _rule(stack, role, "Publish", "topic", sent + [f"{CMD}/{namespace}/*"] * commands)
     CfnOutput(stack, f"{name.capitalize()}Role", value=role.role_arn)
+    return role
+
+
+def _relays(stack: PlatformStack, people: list[iam.Role]) -> None:
+    """Relays for video by WebRTC: who looks may ask for short-lived credentials of a channel's TURN servers.
+    Nothing is signalled over the channel: no role may connect to it."""
+    channel = kinesisvideo.CfnSignalingChannel(stack, "Turn", type="SINGLE_MASTER")
+    actions = ["kinesisvideo:GetIceServerConfig", "kinesisvideo:GetSignalingChannelEndpoint"]
+    for role in people:
+        role.add_to_policy(iam.PolicyStatement(actions=actions, resources=[channel.attr_arn]))
+    CfnOutput(stack, "TurnChannel", value=channel.attr_arn)
 
 
 def _listens(stack: PlatformStack, role: iam.Role, client: str, *, robots: list[str]) -> None:
@@ -258,9 +270,11 @@ class Fleet(PlatformStack):
             template.node.add_dependency(needed)
         # A viewer sees every car, and may ask it for its live messages and its video; a driver also sends
         # commands.
-        _person(self, VIEWER)
+        people = [_person(self, VIEWER)]
         if settings.drivers:
-            _person(self, DRIVER, commands=True)
+            people.append(_person(self, DRIVER, commands=True))
+        if settings.turn:
+            _relays(self, people)
         if settings.public:
             public_identity(self)
         CfnOutput(self, "LiveTransport", value=settings.live_transport)

@@ -146,6 +146,12 @@ class Settings(BaseModel):
         description="makes the role of [drivers](../explanation/security.md#viewers-and-drivers), who drive "
         "from the page. `false`: nobody drives from a browser",
     )
+    turn: bool = Field(
+        default=False,
+        description="relays for video across the internet: STUN and TURN servers of Amazon Kinesis Video "
+        "Streams, with credentials for minutes ([how](../how-to/deploy.md#video-across-the-internet)). "
+        "`false`: video goes directly, or as pictures over the broker",
+    )
     live_concurrency: Annotated[int, Field(ge=0, le=1000)] | None = Field(
         default=None,
         description="reserved concurrency of Lambda 1, which also limits it; 0: nothing. Without a value: 5 "
@@ -341,6 +347,11 @@ class Settings(BaseModel):
         if settings.site and settings.embedded:
             raise SettingsError(
                 "context site: the embedded cloud has no CloudFront; `make demo` serves the page"
+            )
+        if settings.turn and settings.embedded:
+            raise SettingsError(
+                "context turn: the embedded cloud has no relays; `video.turn` in car.yaml names a server of "
+                "your own"
             )
         if settings.public and not settings.site_robots:
             raise SettingsError(

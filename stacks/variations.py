@@ -20,6 +20,7 @@ FLIPS: dict[str, dict[str, Any]] = {
     "account": {"device_defender": True, "iot_log_level": "error"},
     "site": {"site": True, "site_robots": ["car1"]},
     "drivers": {"drivers": True},
+    "turn": {"turn": True},
     "PubNub": {"live_transport": PUBNUB},
     "no nightly analysis": {"nightly_analysis": False},
     "properties": {

@@ -167,10 +167,12 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def synthesized():
-    """The app in stage dev, with every rule, drivers and the settings of the whole account."""
+    """The app in stage dev, with every rule, drivers, relays and the settings of the whole account."""
     from tests.stacks.templates import synthesize
 
-    return synthesize(device_defender=True, iot_log_level="error", drivers=True, live_transport="pubnub")
+    return synthesize(
+        device_defender=True, iot_log_level="error", drivers=True, turn=True, live_transport="pubnub"
+    )
 
 
 @pytest.fixture(scope="session")
@@ -189,5 +191,6 @@ def production():
         iot_log_level="error",
         robot_metrics=True,
         drivers=True,
+        turn=True,
         live_transport="pubnub",
     )

@@ -82,6 +82,9 @@ READS_DRIVES = {
 PEOPLE = "arn:${AWS::Partition}:iam::${AWS::AccountId}:root"
 
 
+RELAYS = ("GetIceServerConfig", "GetSignalingChannelEndpoint")
+
+
 def listener(name: str) -> set[tuple[str, str]]:
     """The permissions to connect, and to hear robots' live messages."""
     return {
@@ -99,6 +102,8 @@ def person(name: str, *sends: str) -> set[tuple[str, str]]:
         *(("iot:Publish", f"{IOT}:topic/{topic}") for topic in (*looks, *sends)),
         *(("iot:Subscribe", f"{IOT}:topicfilter/view/iort/*/{last}") for last in ("picture", "to-*")),
         *(("iot:Receive", f"{IOT}:topic/view/iort/*/{last}") for last in ("picture", "to-*")),
+        # Relays, with `turn`.
+        *((f"kinesisvideo:{action}", "Turn.Arn") for action in RELAYS),
     }
 
 

@@ -160,6 +160,7 @@ def test_the_context_sets_the_settings(settings, tmp_path):
         ({"site_robots": "car1,*"}, ["robot name", "*"]),
         ({"site": True}, ["site_robots", "car1,car2", "* for all"]),
         ({"embedded": True}, ["site_robots", "got none"]),
+        ({"embedded": True, "turn": True}, ["turn", "video.turn"]),
         ({"site_robots": [f"car{i}" for i in range(51)]}, ["site_robots", "at most 50 robots"]),
         ({"page_url": "page.example.org"}, ["page_url", "must match", "got 'page.example.org'"]),
         ({"tags": "aws:x=1"}, ["tags", "'aws:x=1'"]),

@@ -49,6 +49,13 @@ def test_the_default_deployment_needs_no_third_party(deployment):
 # --- tables -----------------------------------------------------------------------------------------
 
 
+def test_relays_are_off_by_default_and_cost_nothing_then(deployment, synthesized):
+    kind = "AWS::KinesisVideo::SignalingChannel"
+    assert len(synthesized.resources(kind)) == 1
+    assert deployment().resources(kind) == {}
+    assert "kinesisvideo" not in json.dumps(dict(deployment().templates))
+
+
 def test_no_table_takes_more_than_the_fleet_and_one_robot_at_its_worst(deployment):
     def most(**settings):
         resources = deployment(**settings).templates["storage"]["Resources"]

@@ -81,6 +81,21 @@ class SocketAnswer(TypedDict):
     client_id: str
 
 
+class IceServerEntry(TypedDict):
+    """A STUN or TURN server, as a browser takes it; ``username`` and ``credential`` are a TURN server's."""
+
+    urls: list[str]
+    username: str
+    credential: str
+
+
+class IceAnswer(TypedDict):
+    """Answers ``ice``: the deployment's servers for video by WebRTC, for a session that begins now; none
+    without the setting ``turn``. Their credentials end within minutes, so ask before each offer."""
+
+    ice_servers: list[IceServerEntry]
+
+
 class Admitted(TypedDict):
     """Answers ``key``, once for each token; or again for the key itself."""
 
@@ -465,6 +480,7 @@ Answer = Union[
     KeepAnswer,
     RobotsAnswer,
     SocketAnswer,
+    IceAnswer,
     TagsAnswer,
     VehiclesAnswer,
     StreamsAnswer,

@@ -13,7 +13,14 @@ from typing import Any
 
 from iort_contract.cloud import DRIVER, VIEWER
 from iort_contract.messages.commands import MAX_LEASE_MS
-from iort_contract.messages.page import Answer, SendAnswer, SettingEntry, SettingKind, SettingsAnswer
+from iort_contract.messages.page import (
+    Answer,
+    IceAnswer,
+    SendAnswer,
+    SettingEntry,
+    SettingKind,
+    SettingsAnswer,
+)
 from iort_contract.messages.shadow import FIELDS, MOTION_STOPPED, SETTINGS, Choice, Flag, Number
 from iort_contract.tables import ONLINE
 from iort_contract.topics import ACCEPTED
@@ -23,6 +30,7 @@ from iort_station.data import inventory
 from iort_station.errors import StationError
 from iort_station.fleet import control, registry, robots
 from iort_station.fleet.control import Shadow, State
+from iort_station.fleet.relays import Relays
 from iort_station.fleet.roles import has_drivers
 from iort_station.operations import alarms, cloudwatch
 from iort_station.page import history, incidents, insights, motion, triggers
@@ -41,6 +49,7 @@ def answers(cloud: Cloud, track: Track | None = None) -> dict[str, Callable[[Map
         return whole(request, "minutes", 1, 14 * 24 * 60)
 
     counts, pictures = incidents.Counts(cloud), incidents.Pictures(cloud)
+    relays = Relays(cloud)
     return {
         "robots": lambda _request: {"robots": registry.presence(cloud)},
         "tags": lambda _request: {"tags": robots.tags(cloud)},
@@ -71,6 +80,7 @@ def answers(cloud: Cloud, track: Track | None = None) -> dict[str, Callable[[Map
         "incident_picture": pictures.answer,
         "motion": motion.fleet(cloud).motion,
         "socket": lambda _request: motion.address(cloud, VIEWER),
+        "ice": lambda _request: ice(relays),
     }
 
 
@@ -104,6 +114,16 @@ def keyed_actions(cloud: Cloud) -> dict[str, Handler]:
 def downloads(cloud: Cloud) -> dict[str, Download]:
     """Every file, by its name."""
     return {**history.downloads(cloud), "incident.mcap": partial(incidents.download, cloud)}
+
+
+def ice(relays: Relays) -> IceAnswer:
+    """The deployment's servers for WebRTC."""
+    return {
+        "ice_servers": [
+            {"urls": list(one.urls), "username": one.username, "credential": one.credential}
+            for one in relays.servers()
+        ]
+    }
 
 
 def send(cloud: Cloud, request: Mapping[str, str]) -> Generator[None, None, SendAnswer]:

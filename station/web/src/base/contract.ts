@@ -445,6 +445,18 @@ export interface SocketAnswer {
   readonly client_id: string;
 }
 
+/** A STUN or TURN server, as a browser takes it; ``username`` and ``credential`` are a TURN server's. */
+export interface IceServerEntry {
+  readonly urls: readonly string[];
+  readonly username: string;
+  readonly credential: string;
+}
+
+/** Answers ``ice``: the deployment's servers for video by WebRTC, for a session that begins now; none without the setting ``turn``. Their credentials end within minutes, so ask before each offer. */
+export interface IceAnswer {
+  readonly ice_servers: readonly IceServerEntry[];
+}
+
 /** Answers ``key``, once for each token; or again for the key itself. */
 export interface Admitted {
   readonly key: string;
