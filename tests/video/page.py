@@ -8,11 +8,11 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from iort_contract.counter import CHECK_BITS, COLUMNS, HEIGHTS, NUMBER_BITS, ROWS
 from playwright.sync_api import Browser, Page, Playwright, sync_playwright
 from playwright.sync_api import Error as PlaywrightError
 from typing_extensions import Self
 
+from iort_contract.counter import CHECK_BITS, COLUMNS, HEIGHTS, NUMBER_BITS, ROWS
 from testkit.chromium import Tabs
 from testkit.proxy import Proxy
 from testkit.waiting import GUARD_S, InstrumentError, until

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from iort_contract.counter import read_counter
-
 from testkit.video_viewer import main
 
 
