@@ -45,9 +45,14 @@ from iort_agent.recorder.segment import require_mcap
 from iort_agent.ros import Graph
 from iort_agent.ros.ros1_node import DEFAULT_NODE
 from iort_agent.sources.registry import SourceRun
+from iort_agent.sources.ros import RosConfig
 from iort_agent.sources.sim import SimSource
 from iort_agent.spool import Spool
 from iort_agent.video import Pictures
+from iort_agent.video.capture import make_camera
+from iort_agent.video.config import TopicCamera, VideoConfig
+from iort_agent.video.kept import keeper
+from iort_agent.video.video import Video
 from iort_contract.catalog.streams import DRIVE_STREAM, OWN_STREAMS
 from iort_contract.cloud import IOT
 from iort_contract.limits import Value
@@ -127,6 +132,9 @@ class Agent:
         self.recorder = self._make_recorder(graph)
         for run in self.sources if self.recorder is None else ():
             run.without_recorder()
+        # Motion is bound to them also if the camera does not work.
+        self.pictures = Pictures()
+        self.video = self._make_video(link)
         self.shadow = Shadow(
             link,
             base=base,
@@ -138,6 +146,7 @@ class Agent:
             moves=config.downlink.moves(),
             recorder=self.recorder,
             no_recorder=self.no_recorder or NO_RECORDER,
+            video=config.video.terms() if config.video is not None else None,
         )
         if self.recorder is not None:
             self.recorder.on_answers = self.shadow.tell
@@ -145,8 +154,6 @@ class Agent:
         uploader = None
         if config.files.folder or config.files.large_folder or config.downlink.ask or self.recorder:
             uploader = make_uploader(link, root_ca=config.root_ca, rate_kb_s=config.files.rate_kb_s)
-        # Motion is bound to them also if the camera does not work.
-        self.pictures = Pictures()
         video = config.video
         self.downlink = make_downlink(
             config.downlink,
@@ -244,6 +251,40 @@ class Agent:
             _log.error("%s", self.no_recorder)
             return None
 
+    def _make_video(self, link: Link) -> Video | None:
+        """The video of a configuration that has some. Raises `SourceError` without ROS for a topic."""
+        config, recorder, video = self.config, self.recorder, self.config.video
+        if video is None:
+            return None
+        car = next((run.source for run in self.sources if isinstance(run.source, SimSource)), None)
+        ros = config.downlink.graph(config.sources)
+        graph = None
+        if isinstance(video.source, TopicCamera):
+            graph = NODES[ros.version](ros.node or DEFAULT_NODE, self.clock)
+        keep = None
+        if recorder is not None and not self._in_ring(video):
+            keep = keeper(recorder.ring.take, ros.version)
+        return Video(
+            video,
+            link,
+            self.pictures,
+            camera=lambda: make_camera(video, self.clock, graph=graph, car=car),
+            record=self.streams.record,
+            keep=keep,
+            graph=graph,
+            offset_us=self.offset.known_us,
+        )
+
+    def _in_ring(self, video: VideoConfig) -> bool:
+        """Whether the ring has the camera's pictures as a topic's messages."""
+        source = video.source
+        return isinstance(source, TopicCamera) and any(
+            source.topic == name
+            for config in self.config.sources
+            if isinstance(config, RosConfig)
+            for name, _ in config.topics
+        )
+
     def _state(self) -> dict[str, Any]:
         """The agent at an edge, for the incident's file."""
         connection, offset = self.uplink.status(), self.offset.estimate()
@@ -308,6 +349,7 @@ def make_status(agent: Agent) -> Status:
         downlink=agent.downlink.report() if agent.downlink is not None else None,
         files=_files(agent),
         recorder=agent.recorder.report() if agent.recorder is not None else None,
+        video=agent.video.report() if agent.video is not None else None,
         clock=agent.offset.estimate(),
         pings=agent.pings.report(),
         over_share=agent.shadow.over_share,
@@ -341,6 +383,7 @@ def _alarms(agent: Agent) -> list[str]:
     alarms = [alarm for alarm in (agent.spool.alarm, agent.record.alarm) if alarm] + WATCH.alarms()
     alarms += agent.recorder.alarms() if agent.recorder is not None else []
     alarms += [agent.no_recorder] if agent.no_recorder is not None else []
+    alarms += agent.video.alarms() if agent.video is not None else []
     alarms += [f"source failed: {source.description}" for source in agent.sources if source.failed]
     waits = [source.waits() for source in agent.sources]
     if agent.downlink is not None:

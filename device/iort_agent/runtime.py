@@ -88,6 +88,8 @@ class Runtime:
         uploader = None if uploads is None else Supervised("uploads", lambda: uploads.run(uploads_stop))
         if agent.recorder is not None:
             agent.recorder.start()
+        if agent.video is not None:
+            agent.video.start()
         for thread in (record, ticker, *sources, pinger, *([uploader] if uploader is not None else [])):
             thread.start()
         if sources:
@@ -98,6 +100,8 @@ class Runtime:
             # An agent that ends by itself must not end an emergency stop.
             agent.downlink.halt(keep_stop=not self._asked)
         agent.pings.wake()
+        if agent.video is not None:
+            agent.video.close()
         for thread in (*sources, ticker, pinger):
             thread.join()
         uploaded = bool(sources) or self._end_incidents(drain_s)

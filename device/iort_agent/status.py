@@ -165,6 +165,8 @@ def render(status: Status) -> str:
         lines += _files(status.files)
     if status.recorder is not None:
         lines.append(f"recorder  {_told(status.recorder)}")
+    if status.video is not None:
+        lines.append(f"video     {_told(status.video) or 'nobody looks'}")
     if status.clock is not None:
         offset_ms, uncertainty_ms = status.clock.offset_ms, status.clock.uncertainty_ms
         lines.append(

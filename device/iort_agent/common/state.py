@@ -144,6 +144,7 @@ class Status:
     downlink: Optional[Counts]
     files: Optional[Files]
     recorder: Optional[Counts]
+    video: Optional[Counts]
     clock: Optional[ClockOffset]
     pings: Dict[str, RoundTrips]
     over_share: Optional[OverShare]

@@ -105,6 +105,7 @@ THREADS = {
     "ticker": Kind(longest_s=1.0),
     "uplink": Kind(longest_s=1.0),
     "uploads": Kind(),
+    "video": Kind(longest_s=1.0),
 }
 
 

@@ -35,6 +35,7 @@ from iort_contract.messages.shadow import (
     decode_desired,
     encode_reported,
 )
+from iort_contract.messages.video import VideoTerms
 from iort_contract.topics import ACCEPTED, SHADOW, check_stream
 
 _PLACE = Place(Path("shadow agent"))
@@ -123,7 +124,7 @@ class Shadow:
     the cloud's last report of batches that it put off. ``in_force`` are the
     settings until the shadow is known, if not the file's. ``drive`` and ``moves`` are reported: what a stick
     drives, and whether the robot has a motion that can be stopped. ``no_recorder`` is the answer to triggers
-    without a recorder."""
+    without a recorder. ``video`` is what the camera can show."""
 
     def __init__(
         self,
@@ -138,12 +139,14 @@ class Shadow:
         moves: bool = False,
         recorder: Recorder | None = None,
         no_recorder: str = NO_RECORDER,
+        video: VideoTerms | None = None,
     ) -> None:
         self._recorder, self._no_recorder = recorder, no_recorder
         self._base, self.settings = base, in_force or base
         self._apply = apply
         self._known_fields = known_fields
         self._agent_version, self._drive, self._moves = version, drive, moves
+        self._video = video
         self._link, self._uplink, self._clock = link, link.uplink, link.clock
         prefix = f"$aws/things/{link.robot}/shadow/name/{SHADOW}"
         self._get, self._update = f"{prefix}/get", f"{prefix}/update"
@@ -319,6 +322,7 @@ class Shadow:
                 self._drive,
                 self._moves,
                 recorder.answers if recorder is not None else dict.fromkeys(wanted, self._no_recorder),
+                self._video,
             )
         )
 

@@ -46,6 +46,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
         yield from source.check(f"source {i} ({source.describe()})")
     yield from _queue(config)
     yield from _recorder(config)
+    yield from config.video.check() if config.video is not None else ()
     yield _lanes(config)
     yield emergency_stop(config)
     yield from rows(config, running)

@@ -35,8 +35,7 @@ from iort_contract.messages.video import CHANNEL, MARKS_REPEATED, IceServer, Mar
 
 _log = logging.getLogger(__name__)
 
-# Whoever has not connected then will not; and gathering candidates asks servers for some seconds at most.
-CONNECT_S, ANSWER_S, CLOSE_S = 15.0, 12.0, 5.0
+CLOSE_S = 5.0
 # A viewer reports once or twice a second. One that is not heard for longer is out of reach: it gets nothing.
 QUIET_S = 6.0
 # What a viewer may send on the data channel in a second, and what is not counted as garbage.
@@ -81,22 +80,23 @@ class _Track(MediaStreamTrack):
 
 
 class Session:
-    """One viewer. ``codec`` is vp8 or h264. ``on_key`` is called when it needs a key picture, ``on_end`` with
-    the reason if it ends by itself, perhaps more than once."""
+    """One viewer. ``codec`` is vp8 or h264. ``on_key`` is called when it needs a key picture, ``on_sent``
+    with the milliseconds from a picture's capture until it was sent, ``on_end`` with the reason if it ends by
+    itself, perhaps more than once."""
 
     def __init__(
         self,
-        viewer: str,
         servers: Iterable[IceServer],
         *,
         codec: str,
         clock: Clock,
         rate: Rate,
         on_key: Callable[[], object],
+        on_sent: Callable[[float], object],
         on_end: Callable[[str], object],
     ) -> None:
-        self.viewer, self.rate = viewer, rate
-        self._clock, self._on_key, self._on_end = clock, on_key, on_end
+        self.rate = rate
+        self._clock, self._on_key, self._on_sent, self._on_end = clock, on_key, on_sent, on_end
         self._peer = RTCPeerConnection(
             # Without a list aiortc asks a server of its own choice.
             RTCConfiguration(
@@ -132,7 +132,6 @@ class Session:
         self._second, self._in_second = 0, 0
         self.connected = False
         self.sent = self.skipped = self.garbage = 0
-        self.sent_ms: deque[float] = deque(maxlen=300)
 
     async def answer(self, sdp: str) -> str:
         """The answer to an offer that is `iort_agent.video.offers.bounded`. Raises `VideoError` with what is
@@ -192,7 +191,7 @@ class Session:
 
     def _note_sent(self, picture: Shown) -> None:
         self.sent += 1
-        self.sent_ms.append((self._clock.monotonic() - picture.encoded.frame.monotonic) * 1000)
+        self._on_sent((self._clock.monotonic() - picture.encoded.frame.monotonic) * 1000)
         origin = self._tap.origin(picture.packet.pts or 0)
         if origin != self._origin:
             # The first one: now it is known.

@@ -16,6 +16,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Awaitable, Callable, NamedTuple, Protocol, Sequence
@@ -25,6 +26,7 @@ from iort_agent.errors import VideoError
 from iort_agent.mqtt.rate_limiter import URGENT
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_agent.video.offers import bounded, of_deployment
+from iort_agent.video.rate import Rate
 from iort_contract.limits import ContractError
 from iort_contract.messages.video import (
     ANSWER,
@@ -64,8 +66,11 @@ class Session(Protocol):
     """A viewer's WebRTC session; `iort_agent.video.sessions.Session` is the real one."""
 
     connected: bool
+    rate: Rate
 
     def answer(self, sdp: str) -> Awaitable[str]: ...
+    def show(self, picture: Any) -> None: ...
+    def missed(self) -> None: ...
     def close(self) -> Awaitable[None]: ...
 
 
@@ -110,7 +115,7 @@ class _Bucket:
 
 
 class Signalling:
-    """Made once. `arrive` and `wake` may be called from any thread, all else in the loop of `run`.
+    """Made once. `arrive`, `wake` and `post` may be called from any thread, all else in the loop of `run`.
 
     ``why_not`` says why nothing can be shown now, or is empty; ``make`` makes sessions; ``own`` are the
     servers of car.yaml; ``on_demand`` is told who looks, after every change.
@@ -148,7 +153,7 @@ class Signalling:
         """Who looks, as `on_demand` was told."""
         return self._told
 
-    def sessions(self) -> list[Any]:
+    def sessions(self) -> list[Session]:
         """The sessions that there are."""
         return [viewer.session for viewer in self._viewers.values() if viewer.session is not None]
 
@@ -169,12 +174,17 @@ class Signalling:
 
     def wake(self) -> None:
         """Let `run` look at what has changed."""
-        loop, woken = self._loop, self._woken
-        if loop is not None and woken is not None:
-            try:
-                loop.call_soon_threadsafe(woken.set)
-            except RuntimeError:  # closed in this moment; the next run begins with the inbox
-                return
+        woken = self._woken
+        if woken is not None:
+            self.post(woken.set)
+
+    def post(self, call: Callable[[], object]) -> None:
+        """Let the loop call a function, if it runs."""
+        loop = self._loop
+        if loop is not None:
+            # It may end in this moment.
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(call)
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Answer until ``stopped``, which is looked at after `wake`. At its end every session is closed."""

@@ -48,6 +48,7 @@ from iort_agent.status import StatusServer, fetch
 from iort_agent.video import Frame, Pictures
 from iort_agent.video.camera import Camera
 from iort_agent.video.capture import Capture
+from iort_agent.video.config import SimCamera, VideoConfig
 from iort_contract.messages.batch import decode_batch
 from testkit.agent import Loopback, ManualClock, Published
 from tests.unit.agent.control import test_guard
@@ -117,6 +118,7 @@ def in_the_whole_agent(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> N
         ping=PingConfig(rate_hz=20, paths=("broker",)),
         files=FilesConfig(folder=files),
         recorder=RecorderConfig(folder=folder / "ring", keep_free_mb=0),
+        video=VideoConfig(SimCamera()),
     )
     uplink = Loopback(clock, Dispatcher())
     spool = SqliteSpool(folder / "queue.db", max_bytes=10**9, clock=clock)
@@ -277,7 +279,7 @@ SCENARIOS: dict[str, Scenario] = {
     **dict.fromkeys(
         [
             *("callbacks", "downlink", "incidents", "pings", "record", "recorder", "ring"),
-            *("source", "spool", "ticker", "uploads"),
+            *("source", "spool", "ticker", "uploads", "video"),
         ],
         in_the_whole_agent,
     ),
