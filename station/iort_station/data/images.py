@@ -21,6 +21,7 @@ IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
 MOST_PIXELS = 20_000_000
 # A progressive JPEG needs about ten passes over its pixels. One of thousands takes hours in a few kilobytes.
 _SCAN, _MOST_SCANS = b"\xff\xda", 64
+_PNG = b"\x89PNG"
 
 
 class ImageError(StationError):
@@ -50,6 +51,30 @@ class Images:
         With ``least``, a large image may lose pixels, but keeps so many on its shorter side. Raises
         `StationError` for a damaged image, an unknown encoding, and one of more than `MOST_PIXELS`.
         """
+        sample, data = self._decoded(raw)
+        if not data:
+            return None
+        return _decompressed(data, least) if self._compressed else _of_pixels(sample, data, least)
+
+    def file(self, raw: bytes) -> tuple[bytes, str]:
+        """A message's image as a file, and its ending: JPEG and PNG as they came, pixels as a PNG.
+
+        Raises `StationError` as `pixels`, and if its content was not kept.
+        """
+        from PIL import Image  # noqa: PLC0415 - as below
+
+        pixels = self.pixels(raw)
+        if pixels is None:
+            raise ImageError("the image's content was not kept")
+        if self._compressed:
+            data = self._decoded(raw)[1]
+            return bytes(data), "png" if data.startswith(_PNG) else "jpg"
+        out = io.BytesIO()
+        Image.fromarray(pixels).save(out, "PNG")
+        return out.getvalue(), "png"
+
+    def _decoded(self, raw: bytes) -> tuple[dict[str, Any], Large]:
+        """The fields of a message, and its bytes."""
         try:
             sample: dict[str, Any] = dict(self._decoder.decode(raw))
         except ContractError as error:
@@ -57,9 +82,7 @@ class Images:
         data = sample.get("data")
         if not isinstance(data, Large):
             raise ImageError("the image has no data")
-        if not data:
-            return None
-        return _decompressed(data, least) if self._compressed else _of_pixels(sample, data, least)
+        return sample, data
 
 
 def resized(pixels: Pixels, width: int, height: int) -> Pixels:

@@ -53,6 +53,7 @@ VERBS = {
     "move": ("move", "Copy robots and their recordings into another cloud."),
     "send": ("control", "Send a command and print the robot's answer."),
     "drive": ("drive", "Drive a car by the keys of this terminal."),
+    "sight": ("sight", "Say what the driver of each command saw, and how old it was."),
     "stop": ("control", "Stop robots in an emergency, until --release."),
     "ask": ("control", "Ask the cloud what a robot may ask."),
     "config": ("control", "Show or change a robot's settings."),

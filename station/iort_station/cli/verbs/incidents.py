@@ -91,7 +91,7 @@ def get(
         chosen = [one for one in found if one.incident.state == UPLOADED]
     else:
         chosen = [_one(found, id_) for id_ in which or []]
-    stored = [(one, _stored(cloud, one)) for one in chosen]
+    stored = [(one, file_of(cloud, one)) for one in chosen]
     there = [file for _, file in stored if file is not None]
     fetch(cloud, there, out_folder, force=force, as_json=as_json)
     if not chosen:
@@ -103,7 +103,7 @@ def get(
 def downloaded(cloud: Cloud, id_: str, folder: Path) -> Path:
     """The file of one incident, downloaded into a folder; raises `StationError` if there is none."""
     one = _one(_found(cloud, None, options.Range(None, None)), id_)
-    file = _stored(cloud, one)
+    file = file_of(cloud, one)
     if file is None:
         raise StationError(f"the file of incident {id_} is not in the bucket any more")
     with bar(file.name, file.size) as progress:
@@ -132,7 +132,7 @@ def _one(found: list[RobotIncident], id_: str) -> RobotIncident:
     return one
 
 
-def _stored(cloud: Cloud, one: RobotIncident) -> files.StoredFile | None:
+def file_of(cloud: Cloud, one: RobotIncident) -> files.StoredFile | None:
     """The file of an incident; None if the bucket does not have it. The robot itself has named the key."""
     try:
         file = files.stored(cloud, one.incident.key)
