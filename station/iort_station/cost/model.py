@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from iort_contract.catalog.questions import QUESTIONS
 from iort_contract.cloud import IOT, PUBNUB
+from iort_contract.messages.live import VIEW_RENEW_S
 from iort_station.cost.prices import MONTH_DAYS, PRICES, PUBNUB_MAU_PLANS
 from iort_station.cost.usage import Usage
 
@@ -56,6 +57,9 @@ ARCHIVED_SHARE = 0.60
 # Bytes that the functions log in embedded metric format; a test compares them with functions/.
 _LIVE_LINE, _SUMMARIZE_LINE, _HEALTH_LINE, _PONG_LINE, _PRESENCE_LINE = 480, 310, 300, 220, 230
 _ANSWER_LINE, _ARCHIVE_LINE, _ANALYSIS_LINE, _INCIDENT_LINE = 260, 330, 260, 225
+# A picture's mark and the topic before it; and the units of 5 KB of a session's messages, by their bytes of
+# some 0.2, 1, 4 and 3 KB.
+_PICTURE_HEAD, _SESSION_UNITS = 100, 4
 # Lambda's own lines START, END and REPORT of an invocation.
 PLATFORM_BYTES = 264
 
@@ -167,6 +171,7 @@ def capabilities(usage: Usage) -> dict[str, Table]:
             **_function(usage, questions, answer_mb, 30.0, questions * _ANSWER_LINE),
         },
         "incidents": _incidents(usage) if usage.incidents_per_hour else {},
+        "video": _video(usage) if usage.video_minutes else {},
         "archive": _archive(usage) if usage.archive_days else {},
         "analysis": _analysis(usage) if usage.drive_minutes else {},
     }
@@ -200,6 +205,32 @@ def _incidents(usage: Usage) -> Table:
         "write": 2 * samples + 2 * noted + samples / 2,
         **_kept(usage, (2 * samples, 4 * OWN_ITEM_BYTES)),
         **_function(usage, samples, 256, 400.0, noted * _INCIDENT_LINE),
+    }
+
+
+def _video(usage: Usage) -> Table:
+    """Video, of which AWS sees nothing but its signalling while it goes directly. At most: both ends of a
+    session have a relay, and what leaves AWS IoT is counted as data transfer too, which its pages do not
+    name."""
+    minutes, viewers = usage.video_minutes, usage.viewers
+    relayed, pictures = (minutes * share for share in (usage.video_relayed, usage.video_broker))
+    # A robot sends a picture once for all viewers.
+    sent = pictures * 60 * usage.picture_hz
+    a_picture = units(usage.picture_bytes + _PICTURE_HEAD, METER)
+    # A viewer renews; a session has a question, its answer, an offer and its answer. Each is sent and heard.
+    looks = viewers * (minutes * 60 / VIEW_RENEW_S + _SESSION_UNITS)
+    left_kb = viewers * (relayed * 60 * usage.video_kbps / 8 + sent * usage.picture_bytes / 1000)
+    # The numbers and times of what was captured: a batch a second on the record lane, as of `agent, rtt`.
+    batches = minutes * 60
+    return {
+        "message": 2 * looks + sent * a_picture * (1 + viewers),
+        # A page has a connection of its own for it.
+        "connection": minutes * viewers,
+        "relay_minute": 2 * relayed * viewers,
+        "transfer_out": left_kb / 1e6,
+        **dict.fromkeys(("rule", "action", "read"), batches),
+        "write": 2 * batches,
+        **_kept(usage, (2 * batches, OWN_ITEM_BYTES)),
     }
 
 

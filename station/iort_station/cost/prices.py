@@ -64,6 +64,10 @@ PRICES = {
     "alarm": Price("CloudWatch", 0.10, 1, "alarm a month"),
     "insights_alarm": Price("CloudWatch", 0.10, 1, "metric a month that a Metrics Insights alarm analyses"),
     "dashboard": Price("CloudWatch", 3.00, 1, "dashboard a month"),
+    # Confirmed: both by the page's examples of US East, as copied 2026-10-07.
+    "channel": Price("Kinesis Video Streams", 0.03, 1, "signalling channel a month in which it is used"),
+    "relay_minute": Price("Kinesis Video Streams", 0.12, 1000, "minute of a relay (TURN)"),
+    "transfer_out": Price("data transfer", 0.09, 1, "GB to the internet, of the first 10 TB a month"),
     "queue_request": Price("SQS", 0.40, 1e6, "request"),
     # Confirmed by the page as copied 2019-10-30.
     "key": Price("KMS", 1.00, 1, "key a month"),

@@ -56,6 +56,8 @@ def needs(usage: Usage) -> list[Need]:
     sizes = model.sizes_of(usage.rate_hz, usage.batch_s)
     batches, own, clock = usage.batches_per_s, usage.own_batches_per_s, usage.clock_pings_per_s
     publishes = batches + own + usage.live_hz + 3 * usage.ping_hz + clock
+    if usage.video_minutes * usage.video_broker:
+        publishes += usage.picture_hz
     # Two more rules evaluate each live message that passes the broker. The stream's shards limit Lambda 2, so
     # only Lambda 1 and the pings count.
     by_pubnub = usage.live_hz if usage.live_transport == PUBNUB else 0.0
@@ -183,6 +185,8 @@ def deployment_dollars_per_month(usage: Usage) -> dict[str, float]:
         "metrics requested by the live page": ("metric_request", requested),
         "polling the queues": ("queue_request", polls),
     }
+    if usage.video_minutes * usage.video_relayed:
+        table["relays' signalling channel"] = ("channel", 1)
     if usage.customer_key:
         # SQS requests the queue's key every five minutes (KmsDataKeyReusePeriodSeconds).
         table["key"] = ("key", 1)
@@ -212,6 +216,9 @@ def variations(usage: Usage) -> dict[str, Usage]:
         "round trips measured at 1 Hz": {"ping_hz": 1.0},
         "commands at 10 Hz": {"command_hz": 10.0},
         "a question to the cloud every minute": {"questions_per_hour": 60.0},
+        "video for an hour, directly": {"video_minutes": 60.0},
+        "video for an hour, by relays": {"video_minutes": 60.0, "video_relayed": 1.0},
+        "video for an hour, as pictures over the broker": {"video_minutes": 60.0, "video_broker": 1.0},
         "reconnecting every minute": {"connects_per_hour": 60.0},
         "with Lambda's own log lines": {"function_logs": "all"},
         "kept for 30 days": {"retention_days": 30},

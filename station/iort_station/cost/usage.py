@@ -35,6 +35,10 @@ class Usage:
     ``drive_minutes`` are analysed, 0 for none. Only AWS knows the billed milliseconds ``live_ms`` and
     ``summarize_ms``: they are assumptions.
 
+    Each viewer looks through a robot's camera for ``video_minutes`` of its hour, at ``video_kbps``. The share
+    ``video_relayed`` of that passes a relay, and ``video_broker`` goes as pictures over the broker,
+    ``picture_hz`` of ``picture_bytes``; the rest goes directly.
+
     Alarms by Metrics Insights analyse ``insights_metrics`` together. ``dashboards`` has the metrics on each;
     ``robot_metrics`` adds to the last. ``function_logs`` "all" adds Lambda's own log lines.
     """
@@ -50,6 +54,12 @@ class Usage:
     command_hz: float = 0.0
     questions_per_hour: float = 0.0
     incidents_per_hour: float = 0.0
+    video_minutes: float = 0.0
+    video_relayed: float = 0.0
+    video_broker: float = 0.0
+    video_kbps: float = 1000.0
+    picture_hz: float = 4.0
+    picture_bytes: int = 20_000
     hours_per_day: float = 2.0
     watched_hours: float | None = 2.0
     live_transport: str = IOT
@@ -82,10 +92,17 @@ class Usage:
             ("rate_hz", 0 < self.rate_hz <= 2000, "more than 0 and at most 2000"),
             ("batch_s", self.batch_s <= 1, "0 to 1; 0 sends each sample by itself"),
             ("hours_per_day", 0 < self.hours_per_day <= 24, "more than 0 and at most 24"),
+            ("video_minutes", self.video_minutes <= 60, "0 to 60"),
+            (
+                "video_relayed and video_broker",
+                self.video_relayed + self.video_broker <= 1,
+                "shares of at most 1 together",
+            ),
             ("live_transport", self.live_transport in TRANSPORTS, f"one of {', '.join(TRANSPORTS)}"),
         ):
             if not holds:
-                raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
+                got = " and ".join(str(getattr(self, one)) for one in name.split(" and "))
+                raise UsageError(f"{name} must be {allowed}, got {got}")
         return self
 
     @property

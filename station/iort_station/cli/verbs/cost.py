@@ -36,6 +36,12 @@ _SETTINGS = {
     "command_hz": "Commands a second to a robot.",
     "questions_per_hour": "Questions of a robot to the cloud in an hour.",
     "incidents_per_hour": "Incidents of a robot's event recorder in an hour that are told.",
+    "video_minutes": "Minutes of an hour that each viewer looks through a robot's camera.",
+    "video_relayed": "Share of them by a relay (TURN), 0 to 1.",
+    "video_broker": "Share of them as pictures over the broker, 0 to 1.",
+    "video_kbps": "Bitrate of the video in kbit/s.",
+    "picture_hz": "Pictures a second over the broker.",
+    "picture_bytes": "Bytes of such a picture.",
     "dashboard_hours": "Hours a month that the live page shows CloudWatch.",
 }
 

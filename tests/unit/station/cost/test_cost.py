@@ -91,6 +91,32 @@ CASES = [
         "incidents",
         {"rule": 8, "invocation": 8, "read": 16, "write": 16 + 24 + 4},
     ),
+    # Directly: a renewal every five seconds and four messages of a session are sent and heard; the numbers
+    # of the pictures are recorded in batches of a second.
+    (
+        {"video_minutes": 10.0, "viewers": 2},
+        "video",
+        {
+            "message": 2 * 2 * (120 + 4),
+            "connection": 20,
+            "relay_minute": 0,
+            "transfer_out": 0,
+            "rule": 600,
+            "write": 1200,
+        },
+    ),
+    # A relay at each end; 1 Mbit/s to each viewer is 450 MB an hour.
+    (
+        {"video_minutes": 60.0, "viewers": 2, "video_relayed": 0.5},
+        "video",
+        {"relay_minute": 2 * 30 * 2, "transfer_out": 2 * 0.225},
+    ),
+    # A picture of 20 kB is four messages, sent once and heard by each.
+    (
+        {"video_minutes": 60.0, "viewers": 3, "video_broker": 1.0},
+        "video",
+        {"message": 4 * 4 * _HOUR * (1 + 3) + 2 * 3 * (720 + 4), "transfer_out": 3 * 0.288},
+    ),
     # Three streams; their hours, days and nightly searches; only the driven one's objects are large.
     ({}, "archive", {"queue_request": 3 * 3 * (1 + 0.5 + 0.5), "s3_move": 0.5}),
     ({"rate_hz": 1.0, "hours_per_day": 0.1}, "archive", {"s3_instant": 0, "s3_move": 0}),
@@ -158,6 +184,14 @@ def test_a_larger_fleet_needs_fewer_lambda_2_calls_per_robot():
     assert model.summarize_calls_per_s(Usage(robots=10_000, rate_hz=1000.0)) == 60 / model.WINDOW_S
 
 
+def test_video_costs_nothing_while_nobody_looks():
+    relayed = replace(_ONE, video_relayed=1.0)
+    assert model.bill(relayed) == model.bill(_ONE)
+    assert deployment_dollars_per_month(relayed) == deployment_dollars_per_month(_ONE)
+    looked = deployment_dollars_per_month(replace(relayed, video_minutes=1.0))
+    assert looked["relays' signalling channel"] == 0.03
+
+
 def test_pubnub_counts_publishes_and_receipts_or_users():
     items = model.pubnub_bill(replace(_ONE, viewers=3))
     assert [item.units for item in items] == [36_000, 108_000]
@@ -168,7 +202,16 @@ def test_pubnub_counts_publishes_and_receipts_or_users():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"robots": 0}, {"rate_hz": 0.0}, {"batch_s": 2.0}, {"live_hz": -1.0}, {"hours_per_day": 25.0}]
+    "wrong",
+    [
+        {"robots": 0},
+        {"rate_hz": 0.0},
+        {"batch_s": 2.0},
+        {"live_hz": -1.0},
+        {"hours_per_day": 25.0},
+        {"video_minutes": 61.0},
+        {"video_relayed": 0.6, "video_broker": 0.5},
+    ],
 )
 def test_an_impossible_usage_is_refused(wrong):
     with pytest.raises(StationError):
