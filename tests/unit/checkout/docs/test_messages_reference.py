@@ -76,6 +76,18 @@ from iort_contract.messages.recorder import (
     incident,
 )
 from iort_contract.messages.shadow import CHANGEABLE, decode_desired, decode_reported, encode_reported
+from iort_contract.messages.video import (
+    OFFER,
+    TERMS,
+    IceServer,
+    Look,
+    Show,
+    VideoTerms,
+    decode_look,
+    decode_show,
+    encode_look,
+    encode_show,
+)
 from iort_contract.ros.message import MessageType, message_type
 from iort_contract.tables import (
     OVER_SHARE,
@@ -94,6 +106,10 @@ RUN, T_US = "3f2a9c01d4e5b678", 1_767_261_600_000_000
 SAMPLE = {"speed": 25.2, "voltage_input": 11.9, "fault_code": 0}
 LIVE = LiveSample(RUN, 12, T_US, T_US + 4_000, SAMPLE, offset_us=-1_500, next_ms=100)
 LEASE = Lease("7c0d5e9a21b4f638", 10, 15_000, broker=True)
+RELAY = IceServer(("turn:turn.example.org:3478",), "1767261900:iort", "c2VjcmV0")
+SDP = "v=0\r\no=- 4611731400430051336 2 IN IP4 127.0.0.1\r\n"
+LOOK = Look("7c0d5e9a21b4f638", "5f0c2b7a9e1d4c38", OFFER, 10_000, SDP, (RELAY,))
+SHOW = Show("5f0c2b7a9e1d4c38", TERMS, terms=VideoTerms(640, 480, 15.0, 400))
 HASH = "a591a6d40bf420404a011733cfb7b190d62c65bf0bcda32b57b277d9ad9f146e"
 FILE = File("notes.txt", "log", "text/plain", 12, HASH, T_US)
 ASKED, KEY = "5f0c2b7a9e1d4c38", file_key("car7", FILE)
@@ -144,6 +160,8 @@ WRITTEN: dict[str, tuple[bytes, Callable[[dict[str, Any]], Any], Any]] = {
     "batch": (encode_batch(BATCH), as_object(decode_batch), BATCH),
     "live": (encode_live(LIVE), as_object(decode_live), LIVE),
     "lease": (encode_lease(LEASE), as_object(decode_lease), LEASE),
+    "look": (encode_look(LOOK), lambda message: decode_look(json.dumps(message).encode()), LOOK),
+    "show": (encode_show(SHOW), as_object(decode_show), SHOW),
     "ping": (PING, as_object(decode_pong), Pong(17, T_US, None)),
     "pong": (PONG, as_object(decode_pong), Pong(17, T_US, T_US // 1000 + 30)),
     "command": (encode_command(COMMAND), as_object(decode_command), COMMAND),
@@ -255,6 +273,10 @@ BOUNDS = [
     ("file", "file.t", 0, -1, "from 1970 on"),
     ("file", "parts", {}, {"2": HASH}, "from 1"),
     ("refused", "again_s", 86_400, 86_401, "0 to 86,400"),
+    ("look", "viewer", "f" * 32, "f" * 33, "`boot`"),
+    ("look", "lease_ms", 15_000, 15_001, "0 to 15,000"),
+    ("look", "ice_servers", [{"urls": ["stun:a"]}] * 8, [{"urls": ["stun:a"]}] * 9, "up to 8"),
+    ("look", "sdp", "v" * 32 * 1024, "v" * (32 * 1024 + 1), "up to 32 KiB"),
     ("ask", "id", "f" * 32, "F" * 32, "`boot`"),
     ("ask_file", "file.size", 0, -1, "from 0"),
 ]
