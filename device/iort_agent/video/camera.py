@@ -45,13 +45,16 @@ class Pacer:
     """Keeps pictures to a rate: those between are left out, and none is sent later than it came."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._period_s, self._due = 1 / rate_hz, float("-inf")
+        self._period_s = 1 / rate_hz
+        self._due: float | None = None
 
     def takes(self, now: float) -> bool:
         """Whether a picture that comes now is to be taken."""
-        if now < self._due - self._period_s * _EARLY:
+        due = now if self._due is None else self._due
+        if now < due - self._period_s * _EARLY:
             return False
-        self._due = max(self._due, now - self._period_s / 2) + self._period_s
+        # One that is late does not delay all those after it.
+        self._due = max(due, now - self._period_s / 2) + self._period_s
         return True
 
 

@@ -126,7 +126,9 @@ def _of_pixels(sample: Mapping[str, Any], content: bytes) -> av.VideoFrame:
     rows = [(whole[: height * step], step, used)]
     if form.halved:
         rows.append((whole[height * step : lines * step], step * form.colours, used * form.colours))
-    return from_rows(name, width, height, rows)
+    picture = from_rows(name, width, height, rows)
+    # ffmpeg's own way from these to YUV exchanges red and blue.
+    return picture.reformat(format="rgb24") if name.startswith("bayer") else picture
 
 
 def _decompressed(content: bytes) -> av.VideoFrame:
