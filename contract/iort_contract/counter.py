@@ -12,9 +12,9 @@ from typing import Callable, Sequence
 COLUMNS, ROWS, HEIGHTS = 24, 2, 24
 NUMBER_BITS, CHECK_BITS = 32, 16
 # A block is read at its middle: codecs mix its edges with its neighbours.
-_PLACES = (0.35, 0.5, 0.65)
+PLACES = (0.35, 0.5, 0.65)
 # What is between them is neither black nor white: no counter, or a damaged one.
-_BLACK, _WHITE = 110, 145
+BLACK, WHITE = 110, 145
 
 
 def counter_bits(number: int) -> list[int]:
@@ -38,11 +38,11 @@ def read_counter(luma: Callable[[int, int], int], width: int, height: int) -> in
         for column in range(COLUMNS):
             middle = [
                 luma(int((column + x) * width / COLUMNS), int(height - (ROWS - row - y) * height / HEIGHTS))
-                for x in _PLACES
-                for y in _PLACES
+                for x in PLACES
+                for y in PLACES
             ]
             mean = sum(middle) / len(middle)
-            if _BLACK < mean < _WHITE:
+            if BLACK < mean < WHITE:
                 return None
-            bits.append(int(mean >= _WHITE))
+            bits.append(int(mean >= WHITE))
     return counter_number(bits)

@@ -48,6 +48,10 @@ class Pacer:
         self._period_s = 1 / rate_hz
         self._due: float | None = None
 
+    def left_s(self, now: float) -> float:
+        """The seconds until the next picture is due; 0 if it is."""
+        return 0.0 if self._due is None else max(0.0, self._due - now)
+
     def takes(self, now: float) -> bool:
         """Whether a picture that comes now is to be taken."""
         due = now if self._due is None else self._due

@@ -17,7 +17,7 @@ from iort_agent.errors import VideoError
 from iort_agent.sources.sim import SimSource
 from iort_agent.sources.sim.driver import Pose
 from iort_agent.video import Frame, require
-from iort_agent.video.camera import FIRST_S, Camera, moment
+from iort_agent.video.camera import FIRST_S, Camera, Pacer, moment
 from iort_agent.video.config import VideoConfig
 from iort_agent.video.pictures import from_planes
 from iort_contract.counter import COLUMNS, HEIGHTS, ROWS, counter_bits
@@ -29,6 +29,8 @@ _PANEL, _HEIGHT, _WALL, _AHEAD, _SIGHT = 1.5, 0.6, 1.1, 1.0, 80.0
 _MOST_PANELS = 400
 # What is nearer than this is cut off, in wheelbases.
 _NEAR = 0.15
+# How soon a car that begins to drive is seen.
+_LOOK_S = 0.1
 # The horizon's place from above, in heights of the picture.
 _HORIZON = 0.4
 
@@ -191,27 +193,25 @@ class HallCamera(Camera):
     """The camera of a simulated car. Raises `VideoError` without Pillow or PyAV."""
 
     def __init__(self, car: SimSource, config: VideoConfig, clock: Clock) -> None:
-        self._car, self._clock, self._period_s = car, clock, 1 / config.rate_hz
+        self._car, self._clock, self._pacer = car, clock, Pacer(config.rate_hz)
         size_m = car.config.vehicle.wheelbase_m
         self._hall = Hall(car.config.track, size_m, config.width, config.height)
-        self._due = float("-inf")
 
     def open(self) -> None:
         pass
 
     def read(self, number: int, stop: threading.Event) -> Frame | None:
-        late_at = self._clock.monotonic() + FIRST_S
-        while self._clock.monotonic() < self._due or self._car.pose is None:
-            if self._car.pose is None and self._clock.monotonic() > late_at:
+        began = self._clock.monotonic()
+        while (pose := self._car.pose) is None:
+            if self._clock.monotonic() - began > FIRST_S:
                 raise VideoError(f"the simulated car has not begun to drive within {FIRST_S:g} s")
-            wait_s = min(self._period_s, max(0.001, self._due - self._clock.monotonic()))
-            if self._clock.wait(stop, wait_s):
+            if self._clock.wait(stop, _LOOK_S):
                 return None
-        if stop.is_set():
+        if self._clock.wait(stop, self._pacer.left_s(self._clock.monotonic())):
             return None
-        now = moment(self._clock)
-        self._due = max(self._due, now.monotonic - self._period_s / 2) + self._period_s
-        picture = self._hall.draw(self._car.pose, number, now.us)
+        now, pose = moment(self._clock), self._car.pose or pose
+        self._pacer.takes(now.monotonic)
+        picture = self._hall.draw(pose, number, now.us)
         return Frame(number, now.us, now.monotonic, picture)
 
     def close(self) -> None:
