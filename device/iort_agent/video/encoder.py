@@ -21,6 +21,8 @@ from iort_agent.video.gstreamer import GstreamerEncoder
 _CHANGE, _LOWER_S, _HIGHER_S = 0.15, 1.0, 4.0
 # Less than this share of the bitrate that libx264 began with: its buffer would let key pictures be too large.
 _MUCH_LESS = 0.3
+# After a longer pause the context is a new one: libvpx takes the pause for bits that it may use.
+_PAUSE_S = 2.0
 # No key pictures but those that are asked for, which viewers do when they begin and after a loss.
 _NEVER = 1_000_000
 _MOST_THREADS = 4
@@ -66,6 +68,9 @@ class PyavEncoder:
         picture, kinds = frame.picture, self._av.video.frame.PictureType
         # A camera's own key pictures are none of ours.
         picture.pict_type = kinds.I if key else kinds.NONE
+        if frame.monotonic - self._last > _PAUSE_S:
+            self._context = None
+        self._last = frame.monotonic
         self._adapt(frame.monotonic)
         # An encoder takes no time twice.
         self._pts = max(self._pts + 1, picture.pts or 0)
