@@ -180,7 +180,7 @@ class GstreamerEncoder:
             return ""
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").splitlines()
-        return next((line for line in lines if "rror" in line), "")[:300]
+        return next((line for line in lines if "err" in line.lower()), "")[:300]
 
 
 def _has_key(unit: bytes) -> bool:
