@@ -26,7 +26,7 @@ from iort_agent.mqtt.rate_limiter import LIVE
 from iort_agent.mqtt.uplink import Link
 from iort_agent.ros import Graph
 from iort_agent.video import EXTRA, Encoded, Frame, Pictures
-from iort_agent.video.camera import Camera
+from iort_agent.video.camera import Camera, Pacer
 from iort_agent.video.capture import Capture
 from iort_agent.video.config import VP8, VideoConfig
 from iort_agent.video.encoder import Encoder, make_encoder
@@ -104,7 +104,7 @@ class Video:
         self._missed = False
         self._wants_key, self._keyed_at = False, float("-inf")
         self._kbps = self._start_kbps()
-        self._picture_due = 0.0
+        self._pacer = Pacer(config.pictures_hz)
         # What is wrong with the camera, and when it is tried again.
         self._trouble, self._again_at = "", 0.0
         self.published = self.held_back = 0
@@ -228,9 +228,10 @@ class Video:
         return _Watched(camera, failed=self._fail, closed=self._forget_encoder)
 
     def _fail(self, why: str) -> None:
-        self._throttled.warn("camera", f"video: the camera does not work: {why}")
-        self._trouble, self._again_at = why, self._clock.monotonic() + AGAIN_S
-        self._signalling.post(lambda: self._signalling.end_all(f"the camera does not work: {why}"))
+        trouble = f"the camera does not work: {why}"
+        self._throttled.warn("camera", f"video: {trouble}")
+        self._trouble, self._again_at = trouble, self._clock.monotonic() + AGAIN_S
+        self._signalling.post(lambda: self._signalling.end_all(trouble))
 
     def _forget_encoder(self) -> None:
         encoder, self._encoder = self._encoder, None
@@ -246,18 +247,16 @@ class Video:
             raise
 
     def _take(self, frame: Frame) -> None:
-        demand, now = self._demand, self._clock.monotonic()
+        demand = self._demand
         self._trouble = ""
         values: dict[str, Value] = {}
         if demand.viewers:
             values = self._encode(frame)
         elif self._encoder is not None:
             self._forget_encoder()
-        if demand.watchers and now >= self._picture_due:
-            # By the pace, not by the last picture: the camera's rate is no multiple of this one.
-            period_s = 1 / self._config.pictures_hz
-            self._picture_due = max(self._picture_due + period_s, now + period_s / 2)
-            values = values or self._publish(frame)
+        if demand.watchers and self._pacer.takes(frame.monotonic):
+            published = self._publish(frame)
+            values = values or published
         if not values:
             return
         if self._keep is not None:

@@ -169,15 +169,18 @@ class Rig(Looks):
 
 
 class Loop:
-    """An asyncio loop in a thread, for viewers."""
+    """An asyncio loop in a thread, for viewers. At its end they vanish."""
 
     def __init__(self) -> None:
+        self.peers: list[RTCPeerConnection] = []
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """End."""
+        for peer in self.peers:
+            self.do(peer.close())
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
         self.loop.close()
@@ -197,17 +200,18 @@ class Seen:
 class Viewer:
     """A viewer by aiortc. ``seen`` are its decoded pictures, ``marks`` what it was told of them."""
 
-    def __init__(self, rig: Looks, loop: Loop) -> None:
+    def __init__(self, rig: Looks, loop: Loop, channel: str = CHANNEL) -> None:
         self._rig, self._loop, self.name = rig, loop, rig.name()
         self.seen: list[Seen] = []
         self.marks: dict[int, Mark] = {}
         self.clocks: list[tuple[int, int]] = []
-        self.peer, self.channel, self.sdp = loop.do(self._offer())
+        self.peer, self.channel, self.sdp = loop.do(self._offer(channel))
 
-    async def _offer(self) -> tuple[Any, Any, str]:
+    async def _offer(self, label: str) -> tuple[Any, Any, str]:
         peer = RTCPeerConnection(RTCConfiguration([]))
+        self._loop.peers.append(peer)
         peer.addTransceiver("video", direction="recvonly")
-        channel = peer.createDataChannel(CHANNEL, ordered=False, maxRetransmits=0)
+        channel = peer.createDataChannel(label, ordered=False, maxRetransmits=0)
         channel.on("message", self._on_message)
         peer.on("track", lambda track: asyncio.ensure_future(self._watch(track)))
         await peer.setLocalDescription(await peer.createOffer())

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+import io
 import math
+import subprocess
+import sys
 import threading
 
 import pytest
+from PIL import Image
 
 from iort_agent.agent import make_status
+from iort_agent.common.threads import WATCH
+from iort_agent.errors import VideoError
 from iort_agent.metrics import MetricsConfig
 from iort_agent.sources.sim import SimConfig
 from iort_agent.status import render
+from iort_agent.video.sessions import MAX_GARBAGE, MESSAGES_PER_S
+from iort_contract.counter import read_counter
 from iort_contract.messages.shadow import decode_reported
+from iort_contract.messages.video import (
+    ASK,
+    END,
+    ENDED,
+    OFFER,
+    PICTURES,
+    REFUSED,
+    TERMS,
+    decode_picture,
+)
 from testkit.waiting import until
 from tests.unit.agent.test_agent import Rig as AgentRig
 from tests.unit.agent.video.rig import CONFIG, Looks, Viewer
@@ -58,3 +76,165 @@ def test_the_whole_agent_shows_the_hall_of_its_simulated_car(loop):
         run.join()
     frames = [frame for batch in agent.batches("video") for frame in batch.columns["frame"]]
     assert set(numbers) <= set(frames)
+
+
+def test_nobody_looks_and_nothing_is_captured_encoded_or_sent(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+    rig.look(viewer.name, END)
+    until(lambda: rig.camera.closed == 1, "the camera's end")
+    assert rig.video.report()["open"] is False
+    assert "encoder" not in rig.video.report()
+    taken = rig.video.report()["captured"]
+    # Numbers go on in the same run.
+    again = Viewer(rig, loop).connect()
+    assert again.sees()[0].number > taken
+    assert rig.camera.opened == 2
+
+
+def test_an_agent_that_nobody_looks_at_has_not_loaded_webrtc():
+    program = """
+import sys
+from iort_agent.sources.sim import SimConfig
+from iort_agent.video.config import SimCamera, VideoConfig
+from tests.unit.agent.test_agent import Rig
+rig = Rig(sources=(SimConfig(),), video=VideoConfig(SimCamera()))
+rig.agent.video.start()
+rig.agent.video.close()
+print([name for name in ("aiortc", "av", "PIL") if name in sys.modules])
+"""
+    output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert output.stdout.strip() == "[]"
+
+
+def test_each_viewer_begins_with_a_key_picture_and_all_share_one_encoder(rig, loop):
+    first = Viewer(rig, loop).connect()
+    first.sees(5)
+    second = Viewer(rig, loop).connect()
+    second.sees(5)
+    assert None not in [one.number for one in first.seen + second.seen]
+    both = {one.number for one in first.seen} & {one.number for one in second.seen}
+    assert len(both) >= 4
+    samples = [values for _, values in rig.samples]
+    assert len({values["frame"] for values in samples}) == len(samples)
+    assert {values["viewers"] for values in samples} == {1, 2}
+    keys = [t_us for t_us, values in rig.samples if values["key"]]
+    assert all(later - earlier >= 490_000 for earlier, later in zip(keys, keys[1:]))
+
+
+def test_a_viewer_that_lost_pictures_gets_a_key_picture(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees(3)
+    (session,) = rig.video._signalling.sessions()
+    # As if the sender had not taken one in time.
+    session.missed()
+    before = session.skipped
+    viewer.sees(10)
+    assert session.skipped > before
+    assert None not in [one.number for one in viewer.seen]
+
+
+def test_a_viewer_with_h264_sees_the_pictures(make_rig, loop):
+    rig = make_rig(codec="h264")
+    viewer = Viewer(rig, loop).connect()
+    assert None not in [one.number for one in viewer.sees(5)]
+
+
+def test_garbage_on_the_data_channel_is_counted_and_bounded(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+    (session,) = rig.video._signalling.sessions()
+    for message in (b"", b"\x02", "text", b"x" * 60_000, b"\x03" * 13):
+        viewer.send(message)
+    until(lambda: session.garbage >= 4, "the garbage")
+    viewer.ask_clock(1)
+    until(lambda: viewer.clocks, "the robot's clock")
+    viewer.sees()
+    for i in range(MAX_GARBAGE + 10 * MESSAGES_PER_S):
+        viewer.ask_clock(i)
+    ended = until(
+        lambda: next((show for show in rig.shows[viewer.name] if show.kind == ENDED), None), "the end"
+    )
+    assert ended.why == "too many messages that are no questions for the clock"
+    until(lambda: rig.video.report()["viewers"] == 0, "the session's end")
+
+
+def test_a_data_channel_of_another_name_is_closed(rig, loop):
+    viewer = Viewer(rig, loop, channel="files").connect()
+    viewer.sees(3)
+    until(lambda: viewer.channel.readyState == "closed", "the channel's end")
+    assert not viewer.marks
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda sdp: "v=0\r\nm=video 9 UDP/TLS/RTP/SAVPF 96\r\n", "the offer cannot be answered"),
+        (lambda sdp: sdp.replace("a=recvonly", "a=sendonly"), "the offer does not receive a video"),
+        (lambda sdp: sdp.replace("VP8", "XYZ"), "the offer cannot be answered"),
+        (lambda sdp: sdp.replace("a=ice-ufrag", "a=ice-xfrag"), "the offer cannot be answered"),
+        (lambda sdp: sdp.replace("m=video ", "m=video x"), "the offer cannot be answered"),
+        (lambda sdp: sdp.replace("a=setup:actpass", "a=setup:perhaps"), "the offer cannot be answered"),
+    ],
+)
+def test_a_bad_offer_is_refused_with_the_reason(rig, loop, change, why):
+    viewer = Viewer(rig, loop)
+    request = rig.look(viewer.name, OFFER, sdp=change(viewer.sdp))
+    shows = rig.shows[viewer.name]
+    refused = until(lambda: next((s for s in shows if s.kind in (REFUSED, ENDED)), None), "the refusal")
+    assert refused.request == request
+    assert refused.why.startswith(why)
+    until(lambda: rig.video.report()["viewers"] == 0, "no session")
+    assert not WATCH.alarms()
+
+
+def test_without_webrtc_all_watchers_share_small_pictures_over_the_broker(make_rig):
+    rig = make_rig(pictures_hz=5.0)
+    watchers = [rig.name(), rig.name()]
+    for watcher in watchers:
+        assert rig.ask(watcher, PICTURES).kind == TERMS
+    until(lambda: len(rig.over_broker) >= 6, "pictures")
+    pictures = [decode_picture(payload) for payload in rig.over_broker]
+    numbers = [picture.number for picture in pictures]
+    assert numbers == sorted(set(numbers))
+    # Five a second, one message for both.
+    assert len(numbers) < rig.video.report()["captured"]
+    for picture in pictures:
+        assert rig.pictures.age_ms(picture.number, rig.clock.monotonic()) > 0
+        image = Image.open(io.BytesIO(picture.jpeg)).convert("L")
+        assert read_counter(lambda x, y, image=image: image.getpixel((x, y)), *image.size) == picture.number
+    assert {values["watchers"] for _, values in rig.samples} <= {1, 2}
+    assert [values["frame"] for _, values in rig.samples][: len(numbers)] == numbers[: len(rig.samples)]
+    assert "encoder" not in rig.video.report()
+
+
+def test_a_camera_that_fails_is_told_to_viewers_and_to_those_who_come(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+    rig.camera.error = VideoError("/dev/video0: unplugged")
+    ended = until(lambda: next((s for s in rig.shows[viewer.name] if s.kind == ENDED), None), "the end")
+    assert ended.why == "the camera does not work: /dev/video0: unplugged"
+    assert rig.ask(rig.name(), ASK).why == "the camera does not work: /dev/video0: unplugged"
+    assert any("unplugged" in alarm for alarm in WATCH.alarms())
+
+
+def test_a_killed_thread_ends_the_sessions_and_new_ones_begin(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+
+    def die():
+        raise SystemExit("killed")
+
+    rig.video._signalling.post(die)
+    until(lambda: [alarm for alarm in WATCH.alarms() if "the thread video" in alarm], "the alarm")
+    until(lambda: rig.camera.closed == 1, "the camera's end")
+    # No newer numbers: whoever drives by sight drives no longer.
+    newest = rig.video.report()["captured"]
+    assert rig.pictures.age_ms(newest + 1, rig.clock.monotonic()) is None
+    assert Viewer(rig, loop).connect().sees()[0].number > newest
+
+
+def test_the_recorder_keeps_the_pictures_that_were_shown(rig, loop):
+    Viewer(rig, loop).connect().sees(5)
+    shown = [values["frame"] for _, values in rig.samples]
+    assert rig.kept[: len(shown)] == shown
