@@ -29,12 +29,16 @@ from iort_agent.sources.recording import BagConfig
 from iort_agent.sources.sim import SimConfig
 from iort_agent.spool import REJECT_NEW, QueueConfig, Spool
 from iort_agent.spool.sqlite import make_spool
+from iort_agent.video import Frame
+from iort_agent.video.config import video_rule
 from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
 from iort_contract.messages.account import lost
 from iort_contract.messages.batch import Batch, decode_batch
-from iort_contract.messages.commands import DRIVE_TYPE
+from iort_contract.messages.commands import DRIVE_TYPE, Command, encode_command
+from iort_contract.messages.video import VideoTerms
 from iort_contract.ros.message import MessageType, message_type
+from iort_contract.topics import SHADOW
 from testkit.agent import Loopback, MemorySpool, Published
 
 T0 = 1_700_000_000_000_000
@@ -98,7 +102,8 @@ class Rig:
     ) -> None:
         config = Config("car1", "host", Path(), Path(), tuple(Script(run) for run in sources))  # type: ignore[misc]  # a part of a source
         self.clock = SystemClock()
-        self.uplink = Loopback(self.clock, Dispatcher(), connected=connected)
+        self.dispatcher = Dispatcher()
+        self.uplink = Loopback(self.clock, self.dispatcher, connected=connected)
         self.spool: Spool = MemorySpool(max_bytes=settings.pop("max_bytes", 10**9), policy=REJECT_NEW)
         if at_end is not None:
             # A queue on disk, no connection, and what is done when the run waits at its end.
@@ -142,6 +147,34 @@ def test_an_emergency_stop_outlives_the_agent_also_without_a_connection(tmp_path
     assert "emergency stop: no motion until an operator releases it" in make_status(second).alarms
     second.apply(replace(second.shadow.settings, motion_stopped=False))
     assert not run().shadow.settings.motion_stopped
+
+
+def test_a_robot_with_a_camera_is_driven_by_the_pictures_that_it_has_numbered(tmp_path: Path) -> None:
+    config, place = {"source": {"type": "sim"}, "max_age_ms": 5000}, Place(tmp_path)
+    rig = Rig(
+        sources=(SimConfig(),),
+        downlink=load(DownlinkConfig, DOWNLINK, place),
+        video=video_rule()(config, place),
+    )
+    agent, clock = rig.agent, rig.clock
+    now, now_us = clock.monotonic(), clock.now_us()
+    agent.offset.add(now, now, now_us // 1000)
+    rig.uplink.connect()
+    shadow = {"state": {}, "version": 1}
+    rig.uplink.deliver(f"$aws/things/car1/shadow/name/{SHADOW}/get/accepted", json.dumps(shadow).encode())
+    picture: Any = None
+    agent.pictures.add(Frame(7, now_us, now, picture))
+    seen: list[dict[str, Any]] = [{}, {"frame": 8}, {"frame": 7}, {"blind": True}]
+    for seq, named in enumerate(seen):
+        command = Command("feedbeef", now_us, seq, now_us, 60_000, {}, 10_000, answer=True, **named)
+        rig.uplink.deliver("cmd/iort/car1/drive", encode_command(command))
+        rig.dispatcher.run_pending()
+        agent.shadow.tick()
+    reports = [json.loads(m.payload) for m in rig.uplink.published if m.topic.endswith("/update")]
+    reported = [report["state"]["reported"] for report in reports]
+    outcomes = [one["commands"]["drive"]["outcome"].partition(",")[0] for one in reported]
+    assert outcomes == ["no picture", "picture late", "accepted", "accepted"]
+    assert reported[0]["video"] == vars(VideoTerms(640, 480, 15.0, 5000))
 
 
 def test_every_sample_is_recorded_and_the_report_says_so() -> None:
