@@ -129,6 +129,7 @@ COMMAND = Command(
     answer=True,
     by="anna",
     takeover=True,
+    frame=4711,
 )
 SAID = FleetMessage(RUN, 7, T_US, {"pose": {"position": {"x": 1.5, "y": 0.0, "z": 0.0}}}, -1_500)
 PING = encode_ping(17, T_US)
