@@ -38,10 +38,13 @@ _OF_ITS_OWN = {
     "iot_log_level": "off",
     "budget_usd": "0",
     "drivers": "true",
+    "turn": "false",
 }
-# The second deployment: a key of the account's own, and everybody's identity, which the page on the web has.
+# The second deployment: a key of the account's own, relays, and everybody's identity, which the page on the
+# web has.
 CHANGES = {
     "customer_key": "true",
+    "turn": "true",
     "site": "true",
     "live_transport": "iot",
     "site_robots": "verify-public",

@@ -26,6 +26,7 @@ GUIDES = {
     "dynamodb-api": f"{_AWS}/amazondynamodb/latest/APIReference",
     "iot": f"{_AWS}/iot/latest/developerguide",
     "iot-api": f"{_AWS}/iot/latest/apireference",
+    "kvs": f"{_AWS}/kinesisvideostreams/latest/dg",
     "lambda": f"{_AWS}/lambda/latest/dg",
     "quotas": f"{_AWS}/general/latest/gr",
     "s3": f"{_AWS}/AmazonS3/latest/userguide",
@@ -34,6 +35,7 @@ GUIDES = {
     "sqs": f"{_AWS}/AWSSimpleQueueService/latest/SQSDeveloperGuide",
     "states": f"{_AWS}/step-functions/latest/dg",
     "states-api": f"{_AWS}/step-functions/latest/apireference",
+    "webrtc": f"{_AWS}/kinesisvideostreams-webrtc-dg/latest/devguide",
 }
 
 Seen = Mapping[str, Any]

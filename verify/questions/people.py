@@ -17,15 +17,18 @@ from urllib.request import Request, urlopen
 from botocore.credentials import ReadOnlyCredentials
 
 from iort_agent.files.upload import trusting
+from iort_agent.video.offers import of_deployment
 from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.cloud import DRIVER, VIEWER
 from iort_contract.messages.live import lease_topic
+from iort_contract.messages.video import answer_topic, look_topic
 from iort_contract.topics import CMD, LIVE
+from iort_station.fleet.relays import Relays
 from iort_station.fleet.roles import Role
 from iort_station.page import motion
 from testkit.mqtt import STALE, WAIT_S, Person
 from testkit.waiting import InstrumentError
-from verify.lab import Lab
+from verify.lab import CannotAskError, Lab
 from verify.question import CHANGED, Seen, question
 
 _HEARD, _SENT = "GRANTED_QOS_1", "SUCCESS"
@@ -52,6 +55,7 @@ def _rights(lab: Lab, connect: Connect, robot: str) -> dict[str, Any]:
         lab.topic(CMD, robot, "drive"),
     )
     view, heard = lease_topic(robot, lab.namespace), list[str]()
+    look, answer = look_topic(robot, lab.namespace), answer_topic(robot, "0badcafe", lab.namespace)
     with connect() as person:
         subscribed = person.online().subscribe(f"{LIVE}/{lab.namespace}/{robot}/+")
         # By the broker's HTTP API, and in this order.
@@ -63,6 +67,10 @@ def _rights(lab: Lab, connect: Connect, robot: str) -> dict[str, Any]:
         "hears_cmd": _may(connect, lambda person: person.subscribe(command)),
         "sends_view": _may(connect, lambda person: person.attempt(view, b"{}")),
         "sends_cmd": _may(connect, lambda person: person.attempt(command, b"{}")),
+        "sends_look": _may(connect, lambda person: person.attempt(look, b"{}")),
+        "hears_looks": _may(connect, lambda person: person.subscribe(look)),
+        "hears_an_answer": _may(connect, lambda person: person.subscribe(answer)),
+        "sends_an_answer": _may(connect, lambda person: person.attempt(answer, b"{}")),
     }
     rights = {name: code in (_HEARD, _SENT) for name, code in codes.items()}
     return {"live": subscribed, "log_is_heard": log in heard, **rights, "note_codes": codes}
@@ -84,6 +92,10 @@ def _expected(*, log: bool, view: bool, command: bool) -> Seen:
         "hears_cmd": False,
         "sends_view": view,
         "sends_cmd": command,
+        "sends_look": view,
+        "hears_looks": False,
+        "hears_an_answer": view,
+        "sends_an_answer": False,
     }
 
 
@@ -94,7 +106,9 @@ def _expected(*, log: bool, view: bool, command: bool) -> Seen:
 )
 def viewer(lab: Lab) -> Seen:
     """With the credentials of the role viewer (AssumeRole), AWS IoT accepts a signed WebSocket, and asks the
-    role alone: live messages and log are heard, a lease is sent, a command is refused."""
+    role alone: live messages and log are heard, a lease is sent, a command is refused. For video it
+    sends requests and hears the answers to a name that it knows; it hears no other viewer's requests, and
+    answers none."""
     return _in_role(lab, VIEWER)
 
 
@@ -144,7 +158,8 @@ def signed_address(lab: Lab) -> Seen:
 def everybody(lab: Lab) -> Seen:
     """Amazon Cognito gives anybody an identity and credentials without a signature. With these a signed
     WebSocket hears the live messages of the page's robots: AWS IoT asks the identity's IAM role alone, and
-    Cognito's session policies allow it, which AWS does not document. Log, commands and leases are refused."""
+    Cognito's session policies allow it, which AWS does not document. Log, commands, leases and
+    video are refused."""
     identity, bundle = motion.identity(lab.cloud), lab.cloud.ca_bundle
 
     def cognito(action: str, **body: str) -> dict[str, Any]:
@@ -166,3 +181,26 @@ def everybody(lab: Lab) -> Seen:
         lambda: Person(lab.cloud, keys, f"{identity['client_prefix']}{secrets.token_hex(8)}"),
         next(iter(identity["robots"]), lab.name("verify-watched")),
     )
+
+
+@question(
+    "people.relays",
+    aws="kvs:API_signaling_GetIceServerConfig kvs:API_signaling_IceServer webrtc:kvswebrtc-limits",
+    phase=CHANGED,
+    expected={"kinds": ["stun", "turn", "turns"], "robots_take_them": True, "kept": True},
+    not_embedded="the embedded cloud has no relays",
+)
+def relays(lab: Lab) -> Seen:
+    """CloudFormation makes a signalling channel without a name. With the role viewer,
+    GetSignalingChannelEndpoint and GetIceServerConfig give TURN servers of the service's domain, which robots
+    take from a viewer, with credentials that are good for over a minute; the STUN server has the same
+    domain."""
+    if lab.cloud.find_output("fleet", "TurnChannel") is None:
+        raise CannotAskError("the deployment has no relays: deploy -c turn=true")
+    asked = Relays(lab.cloud)
+    servers = asked.servers()
+    return {
+        "kinds": sorted({url.partition(":")[0] for server in servers for url in server.urls}),
+        "robots_take_them": of_deployment(servers) == tuple(servers),
+        "kept": asked.servers() is servers,
+    }

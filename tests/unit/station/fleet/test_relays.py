@@ -6,6 +6,7 @@ import boto3
 import pytest
 from botocore.stub import Stubber
 
+from iort_agent.video.offers import of_deployment
 from iort_contract.messages.video import OFFER, IceServer, Look, decode_look, encode_look
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
@@ -97,6 +98,8 @@ def test_a_viewer_gets_the_channels_servers_by_the_viewers_rights(asked):
     # They fit into an offer as they are.
     look = Look("0badcafe", "0badcafe", OFFER, sdp="v=0", ice_servers=tuple(servers))
     assert decode_look(encode_look(look)) == look
+    # A robot takes them from it.
+    assert of_deployment(look.ice_servers) == tuple(servers)
 
 
 def test_they_are_asked_again_a_minute_before_their_credentials_end(asked):
