@@ -19,6 +19,8 @@ from iort_agent.lanes.pings import CLOCK_EVERY_S
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import SHORTEST_S
 from iort_agent.runtime import Runtime
+from iort_agent.video import video
+from iort_agent.video.config import SimCamera, VideoConfig
 from iort_contract.catalog.metrics import METRICS, metrics_of
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.cloud import IOT, PUBNUB
@@ -423,6 +425,8 @@ def test_the_model_has_the_memory_and_the_times_of_stacks_agent_and_page():
     assert (analysis._CORE_MB, large.at_once.drives) == (model.ANALYSIS_MB, model.DRIVES_AT_ONCE)
     assert (archive._MEMORY_MB, storage._RARE_AFTER_DAYS) == (model.ARCHIVE_MB, model.STANDARD_DAYS)
     assert (CLOCK_EVERY_S, SHORTEST_S) == (CLOCK_PING_S, report.SHORTEST_RECONNECT_S)
+    pictures = (video._MOST_BYTES, VideoConfig(SimCamera()).pictures_hz)
+    assert pictures == (Usage().picture_bytes, Usage().picture_hz)
     source = (ROOT / "station/web/src/views/cloudwatch.ts").read_text()
     assert f"const REFRESH_S = {report.PAGE_REFRESH_S};" in source
 

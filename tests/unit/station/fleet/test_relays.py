@@ -11,6 +11,7 @@ from iort_contract.messages.video import OFFER, IceServer, Look, decode_look, en
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet.relays import Relays
+from iort_station.page.answers import ice
 from testkit.agent import ManualClock
 
 CHANNEL = "arn:aws:kinesisvideo:eu-west-1:123456789012:channel/turn/1700000000000"
@@ -100,6 +101,16 @@ def test_a_viewer_gets_the_channels_servers_by_the_viewers_rights(asked):
     assert decode_look(encode_look(look)) == look
     # A robot takes them from it.
     assert of_deployment(look.ice_servers) == tuple(servers)
+
+
+def test_the_pages_server_answers_with_them_as_a_browser_takes_them(asked):
+    assert ice(relays_of(asked, **DEPLOYED)) == {
+        "ice_servers": [
+            {"urls": list(STUN.urls), "username": "", "credential": ""},
+            {"urls": list(URLS), "username": "u", "credential": "p"},
+        ]
+    }
+    assert ice(relays_of(asked)) == {"ice_servers": []}
 
 
 def test_they_are_asked_again_a_minute_before_their_credentials_end(asked):
