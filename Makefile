@@ -95,7 +95,7 @@ prove-lerobot: setup ## let LeRobot itself read a dataset that `iort export` wro
 	@IORT_LEROBOT=$(CURDIR)/build/lerobot/bin/python $(BIN)/python -m pytest -rA tests/unit/station/data/test_lerobot.py
 
 # The options of the bench's sections: `python -m bench.run --help` tells whose.
-BENCH_OPTIONS := CARS DURATION KILLS MEGABYTES MESSAGES NEW OLD PART PRESSES QUICK RATE ROBOTS ROUNDS SECONDS SEED SOAK TRIES
+BENCH_OPTIONS := CARS DURATION KILLS MEGABYTES MESSAGES NEW OLD PART PICTURES PRESSES QUICK RATE ROBOTS ROUNDS SECONDS SEED SOAK TRIES
 
 bench: setup ## measure every table of the thesis, or others: ONLY=query,outage or agent, drive, fleet ..., TARGET=aws OUT=docs/bench
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) \

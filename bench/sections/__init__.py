@@ -34,6 +34,7 @@ ALL = (
     "recorder",
     "import",
     "bridge",
+    "video",
 )
 
 

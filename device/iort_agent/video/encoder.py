@@ -26,7 +26,7 @@ _PAUSE_S = 2.0
 # No key pictures but those that are asked for, which viewers do when they begin and after a loss.
 _NEVER = 1_000_000
 _MOST_THREADS = 4
-_CODECS = {VP8: "libvpx", H264: "libx264"}
+LIBRARIES = {VP8: "libvpx", H264: "libx264"}
 MIMES = {VP8: "video/VP8", H264: "video/H264", GSTREAMER: "video/H264"}
 
 
@@ -116,9 +116,9 @@ class PyavEncoder:
     def _open(self) -> Any:
         config, bits = self._config, self._kbps * 1000
         try:
-            context = self._av.CodecContext.create(_CODECS[config.codec], "w")
+            context = self._av.CodecContext.create(LIBRARIES[config.codec], "w")
         except (ValueError, self._av.error.FFmpegError) as error:
-            name = _CODECS[config.codec]
+            name = LIBRARIES[config.codec]
             raise VideoError(f"this PyAV has no {name}: choose another codec in car.yaml") from error
         context.width, context.height, context.pix_fmt = config.width, config.height, "yuv420p"
         context.time_base = Fraction(1, RTP_HZ)
@@ -126,8 +126,13 @@ class PyavEncoder:
         context.bit_rate, context.gop_size = bits, _NEVER
         # Half of the processors are for the rest of the robot.
         context.thread_count = max(1, min(_MOST_THREADS, (os.cpu_count() or 1) // 2))
-        context.options = _vp8(bits) if config.codec == VP8 else _h264(bits)
+        context.options = options(config.codec, bits)
         return context
+
+
+def options(codec: str, bits: int) -> dict[str, str]:
+    """The settings of libvpx or libx264 for so many bits a second, by ffmpeg's names."""
+    return _vp8(bits) if codec == VP8 else _h264(bits)
 
 
 def _vp8(bits: int) -> dict[str, str]:
