@@ -128,6 +128,7 @@ def several(value: Any) -> list[Any]:
 _ARNS = {
     ("AWS::DynamoDB::Table", "Arn"): "dynamodb:eu-west-1:123456789012:table/x",
     ("AWS::DynamoDB::Table", "StreamArn"): "dynamodb:eu-west-1:123456789012:table/x/stream/x",
+    ("AWS::KinesisVideo::SignalingChannel", "Arn"): "kinesisvideo:eu-west-1:123456789012:channel/x/1",
     ("AWS::KMS::Key", "Arn"): "kms:eu-west-1:123456789012:key/x",
     ("AWS::Lambda::Function", "Arn"): "lambda:eu-west-1:123456789012:function:x",
     ("AWS::Logs::LogGroup", "Arn"): "logs:eu-west-1:123456789012:log-group:x:*",
