@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,6 +14,8 @@ from PIL import Image
 from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
+from iort_agent.video import Frame
+from iort_agent.video.kept import compressed_image, message
 from iort_contract.catalog.streams import DRIVE_STREAM, VIDEO_STREAM
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.files import File, file_key
@@ -228,8 +230,8 @@ def image_file(ros: int, kind: str, pictures: dict[int, bytes], topic: str = "/i
         fields: dict[str, Any] = {"format": "jpeg"}
         if kind == RAW:
             fields = {"height": 2, "width": 2, "encoding": "mono8", "is_bigendian": 0, "step": 2}
-        message = types[kind](header=header, **fields, data=np.frombuffer(data, np.uint8))
-        raw = store.serialize_cdr(message, kind) if ros == 2 else store.serialize_ros1(message, kind)
+        content = types[kind](header=header, **fields, data=np.frombuffer(data, np.uint8))
+        raw = store.serialize_cdr(content, kind) if ros == 2 else store.serialize_ros1(content, kind)
         # The ring's clock is another one.
         writer.add_message(channel, (t_us + 7 * S) * 1000, bytes(raw), t_us * 1000, i)
         writer.add_message(other, (t_us + 7 * S) * 1000, b"{}", t_us * 1000, i)
@@ -253,6 +255,30 @@ def keep(lab, s3):
         lab.tell(about, START + 41 * S)
 
     return keep
+
+
+def kept_file(ros: int, pictures: dict[int, bytes]) -> bytes:
+    """An incident's file with the pictures that an agent keeps itself, by their capture times."""
+    out, kind = io.BytesIO(), compressed_image(ros)
+    writer, nothing = Writer(out), cast("Any", None)
+    writer.start("", "test")
+    schema = writer.register_schema(kind.name, f"ros{ros}msg", kind.definition.encode())
+    channel = writer.register_channel(kind.topic, "cdr" if ros == 2 else "ros1", schema)
+    for i, (t_us, data) in enumerate(pictures.items()):
+        raw = message(Frame(i, t_us, 0.0, nothing), data, ros)
+        writer.add_message(channel, (t_us + 7 * S) * 1000, raw, t_us * 1000, i)
+    writer.finish()
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_the_pictures_that_an_agent_keeps_are_read(
+    lab: Seeing, iort: Any, keep: Any, tmp_path: Any, ros: int
+) -> None:
+    there = {START + t: jpeg(t, width=32, height=24) for t in (0, 133 * MS)}
+    keep(kept_file(ros, there))
+    assert iort("sight", "car", *RANGE, "--pictures", str(tmp_path)).exit_code == 0
+    assert [(tmp_path / f"{number}.jpg").read_bytes() for number in (1, 3)] == list(there.values())
 
 
 @pytest.mark.parametrize("ros", [1, 2])
