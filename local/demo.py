@@ -6,6 +6,7 @@ python -m local.demo --duration 20 --bag drive.bag --report report.json
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import signal
 import socket
@@ -150,6 +151,12 @@ _STATUS_S = 1.0
 _LOOK_S = 1.0
 
 
+def _camera() -> dict[str, Any]:
+    """The section for the simulated car's camera, where the packages for it are installed."""
+    installed = all(importlib.util.find_spec(name) for name in ("aiortc", "av", "PIL"))
+    return {"video": {"source": {"type": "sim"}}} if installed else {}
+
+
 def main() -> None:
     """Run the demo. The exit status is 0 if no sample was lost, 1 if one was, and 2 if it could not run."""
     given = read()
@@ -249,7 +256,7 @@ class _Demo:
         ros2: ros2_car.Ros2 | None = self._options.ros2 or None
         if ros2 is not None:
             return {"sources": [ros2.source()], "downlink": ros2.downlink(MAX_LEASE_MS)}
-        return {"sources": [{"type": "sim", **self._car(ends=ends)}], "downlink": DOWNLINK}
+        return {"sources": [{"type": "sim", **self._car(ends=ends)}], "downlink": DOWNLINK, **_camera()}
 
     def _car(self, *, ends: bool) -> dict[str, Any]:
         """The settings of the simulated car."""

@@ -155,6 +155,10 @@ DOWNLINK_NOTE = """\
 # motion, a stop does nothing. These are the simulated car's. For a car with ROS, name its own topic and type
 # (docs/how-to/drive.md); a car without ROS cannot be moved by commands: remove the section.
 """
+VIDEO_NOTE = """\
+# Its camera, to drive it by sight (docs/how-to/drive.md), where `pip install 'iort-agent[video]'` was done.
+# video: {source: {type: sim}}
+"""
 # Why a robot rejects a stop, and what its operators are told before they need one.
 NO_MOTION = "nothing to stop: downlink.cmd has no command with motion"
 # Why a robot rejects a command of any kind.

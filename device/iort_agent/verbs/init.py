@@ -36,6 +36,7 @@ from iort_agent.verbs.survey import (
     listen,
     ports,
 )
+from iort_agent.video import EXTRA
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.recordings.rosbag import is_ros_own, stream_for
@@ -44,6 +45,9 @@ from iort_contract.topics import matches
 _DEBUG = re.compile(r".*debug.*", re.IGNORECASE)
 # Types whose messages are large, also when none came.
 _PICTURES = re.compile(r"sensor_msgs/(msg/)?((Compressed)?Image|PointCloud2)|.*/(msg/)?CompressedImage")
+# Whose messages the camera of a driver takes.
+_CAMERAS = re.compile(r"sensor_msgs/(msg/)?(Compressed)?Image")
+_VIDEO = re.compile(r"^(# )?video: \{source: \{type: topic|^video\s*:", re.MULTILINE)
 _TYPE = re.compile(r"(\btype:\s*[\"']?[A-Za-z]\w*)/(msg/)?([A-Za-z]\w*)", re.ASCII)
 # A key at the beginning of a line, and what is indented below it or is an item of its list.
 _SOURCES = re.compile(r"^sources[ \t]*:.*\n(?:(?:(?:#.*)?\n)*[ \t-].*\n)*", re.MULTILINE)
@@ -229,6 +233,7 @@ def init(out: Path, *, every: bool, wanted: Sequence[str], listen_s: float, seam
         raise SourceError("; ".join(["nothing to record", *reasons]))
     if any(line.large and not line.left_out for line in lines):
         section += _files(out)
+    section += _camera(out, lines)
     text = f"{_ALONE}\n{section}" if target == out else beside(out, section, version)
     with target.open("x", encoding="utf-8") as file:
         file.write(text)
@@ -249,6 +254,19 @@ def _files(out: Path) -> str:
     if "large_folder" not in files:
         raise ConfigError(f"{out}: files.large_folder: set it first: contents of large topics wait there")
     return ""
+
+
+def _camera(out: Path, lines: Sequence[Line]) -> str:
+    """A hint at the section `video`, with the camera that sends least; none if the file has the section."""
+    before = out.read_text(encoding="utf-8") if out.exists() else ""
+    cameras = [
+        line.topic for line in lines if line.topic.published and _CAMERAS.fullmatch(line.topic.kinds[0])
+    ]
+    if not cameras or _VIDEO.search(before):
+        return ""
+    least = min(cameras, key=lambda topic: (not topic.messages, topic.size))
+    hint = f"# video: {{source: {{type: topic, topic: {least.name}}}}}"
+    return neutral(f"{hint}  # to drive by sight: pip install '{EXTRA}'") + "\n"
 
 
 def _show(left_s: float, topics: int, messages: int) -> None:

@@ -23,7 +23,7 @@ from iort_agent.status import ask
 from iort_agent.verbs.registration import PENDING, SEAMS, Seams, load_claim, register
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
-from iort_contract.messages.commands import DOWNLINK_NOTE, stick_downlink
+from iort_contract.messages.commands import DOWNLINK_NOTE, VIDEO_NOTE, stick_downlink
 from iort_contract.topics import check_robot
 
 _log = logging.getLogger(__name__)
@@ -148,7 +148,7 @@ def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
     if not file.exists():
         content = {**settings, "sources": _DEFAULT_SOURCES}
         downlink = DOWNLINK_NOTE + yaml.safe_dump({"downlink": stick_downlink()}, sort_keys=False)
-        _write_private(file, yaml.safe_dump(content, sort_keys=False) + downlink)
+        _write_private(file, yaml.safe_dump(content, sort_keys=False) + downlink + VIDEO_NOTE)
         return
     lines = file.read_text(encoding="utf-8").splitlines()
     for name, value in settings.items():

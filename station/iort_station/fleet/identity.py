@@ -23,7 +23,7 @@ from cryptography.x509.oid import NameOID
 
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import claim_name, fleet_name
-from iort_contract.messages.commands import DOWNLINK_NOTE, stick_downlink
+from iort_contract.messages.commands import DOWNLINK_NOTE, VIDEO_NOTE, stick_downlink
 from iort_contract.tables import CERTIFICATE_ID, ONLINE, SERIAL, SESSION_VERSION
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
@@ -159,7 +159,7 @@ def write_bundle(
     text = yaml.safe_dump(config, sort_keys=False)
     # Other sources may have no ROS graph to take commands.
     if not {"sources", "downlink"} & settings.keys():
-        text += DOWNLINK_NOTE + yaml.safe_dump({"downlink": stick_downlink()}, sort_keys=False)
+        text += DOWNLINK_NOTE + yaml.safe_dump({"downlink": stick_downlink()}, sort_keys=False) + VIDEO_NOTE
     write_private(bundle.config, text)
 
 

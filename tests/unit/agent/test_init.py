@@ -17,7 +17,8 @@ from iort_agent.ros import OnBytes
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.verbs.init import Seams, init
 from iort_agent.verbs.survey import Polls, ports
-from iort_contract.messages.commands import DOWNLINK_NOTE, stick_downlink
+from iort_agent.video.config import TopicCamera
+from iort_contract.messages.commands import DOWNLINK_NOTE, VIDEO_NOTE, stick_downlink
 from iort_contract.ros.definition import Definition, parse
 from iort_contract.topics import stream_of
 from testkit.agent import ManualClock
@@ -231,6 +232,23 @@ def test_a_folder_for_files_is_asked_for_where_the_section_is_there(robot: Robot
     robot.out.write_text(f"{IDENTITY}files: {{rate_kb_s: 100}}\n")
     with pytest.raises(ConfigError, match=r"files\.large_folder: set it first"):
         robot.init("/camera/*")
+
+
+def test_a_camera_is_hinted_at_once(robot: Robot) -> None:
+    hint = "# video: {source: {type: topic, topic: /camera/image_raw}}"
+    written = robot.init()
+    assert [line.partition("  #")[0] for line in written.read_text().splitlines() if "video:" in line] == [
+        hint
+    ]
+    written.write_text(IDENTITY + written.read_text().replace(hint, hint[2:]))
+    config = load_config(written)
+    assert config.video is not None
+    assert config.video.source == TopicCamera("/camera/image_raw")
+    again = robot.init()
+    assert again.read_text().count("video:") == 1, "it has one"
+    again.unlink()
+    robot.out.write_text(IDENTITY + VIDEO_NOTE)
+    assert hint in robot.init().read_text()
 
 
 def test_a_pattern_without_a_topic_is_an_error_and_nothing_is_written(robot: Robot) -> None:
