@@ -24,7 +24,7 @@ from iort_contract.catalog.streams import (
     ROS_UNITS,
 )
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
-from iort_contract.messages import analysis, commands, insights, live, page
+from iort_contract.messages import analysis, commands, insights, live, page, video
 from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
@@ -102,6 +102,16 @@ def _constants() -> Iterator[str]:
         ),
         analysis: ("MAX_NOTE_CHARACTERS",),
         live: ("LEASE", "VIEW_LEASE_MS", "VIEW_RENEW_S"),
+        video: (
+            "PICTURE_MAX_AGE_MS",
+            "MAX_SDP_BYTES",
+            "CHANNEL",
+            "ECHO_EVERY_MS",
+            "ECHO_KEPT_MS",
+            "VIDEO",
+            "PICTURE",
+            "TO",
+        ),
         served: ("KEY_HEADER", "INVITATION"),
     }.items():
         for name in names:

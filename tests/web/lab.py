@@ -203,6 +203,9 @@ class Lab:
         self.cars = {"car-1": [False, False], "car-9": [False, False]}
         self.confirms = True
         self.streams = [VESC_STREAM]
+        # What car-1's camera can show, and a broker that gives pages addresses, if there is one.
+        self.video = None
+        self.broker = None
         # The cars that were stopped alone.
         self.alone = set()
         # The cars without a command that moves them, which reject a stop.
@@ -315,11 +318,18 @@ class Lab:
             "by": "operator@lab" if told else "",
             "at_ms": round(NOW_S * 1000) if told else 0,
             "drive": LIMITS if name == "car-1" else None,
-            "video": None,
+            "video": self.video if name == "car-1" else None,
         }
 
-    def drive(self, _asked):
+    def drive(self, asked):
+        if self.broker is not None:
+            return self.broker.address(asked)
         raise StationError("the role of a driver cannot be assumed")
+
+    def socket(self, asked):
+        if self.broker is None:
+            raise StationError("the role of a viewer cannot be assumed")
+        return self.broker.address(asked)
 
     def stop(self, asked):
         self.asked.append(dict(asked))
@@ -334,6 +344,7 @@ class Lab:
     def served(self):
         """What its server answers and does."""
         return {
+            **({} if self.broker is None else {"broker": self.broker.origin}),
             "vehicles": {"car-1": {"speed_to_erpm_gain": GAIN}},
             "answers": self.answers(),
             "open_actions": {"acknowledge": self.acknowledge},
@@ -371,6 +382,7 @@ class Lab:
             "dry_run": self.dry_run,
             "raceline": lambda _: {"x_m": [], "y_m": [], "lap_s": 0.0, "reason": "the page has no track"},
             "motion": self.motion,
+            "socket": self.socket,
             "laps": of_laps(analysis.laps),
             "delta": of_laps(analysis.delta),
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},

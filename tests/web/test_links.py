@@ -15,12 +15,11 @@ from local.network.certificates import Authority
 from local.network.servers import Relay
 from testkit.waiting import GUARD_S, until
 from tests.browser import show
+from tests.web.broker import CONNACK, CONNECT, SUBACK, SUBSCRIBE, packets
 from tests.web.cars import Car
 
 # Of one request to subscribe.
 MOST_FILTERS = 8
-CONNECT, SUBSCRIBE = 1, 8
-CONNACK, SUBACK = bytes([0x20, 3, 0, 0, 0]), 0x90
 CREDENTIALS = {"AccessKeyId": "ASIA", "SecretKey": "s", "SessionToken": "t"}
 
 
@@ -37,8 +36,10 @@ class Broker(BackgroundServer):
             return web.json_response({"IdentityId": "i", "Credentials": CREDENTIALS}, headers=cors)
         socket = web.WebSocketResponse(protocols=["mqtt"])
         await socket.prepare(request)
+        sent = bytearray()
         async for message in socket:
-            for kind, body in packets(message.data):
+            sent += message.data
+            for kind, body in packets(sent):
                 if kind == CONNECT:
                     await socket.send_bytes(CONNACK)
                 elif kind == SUBSCRIBE:
@@ -50,16 +51,6 @@ class Broker(BackgroundServer):
                     granted = body[:2] + bytes(1 + count)
                     await socket.send_bytes(bytes([SUBACK, len(granted)]) + granted)
         return socket
-
-
-def packets(sent):
-    """The MQTT packets of a WebSocket's message: kind and body."""
-    while sent:
-        # The length in groups of seven bits; the last group has no high bit.
-        ends = next(i for i in range(1, 5) if sent[i] < 0x80)
-        length = sum((sent[i] & 0x7F) << 7 * (i - 1) for i in range(1, ends + 1))
-        yield sent[0] >> 4, sent[ends + 1 : ends + 1 + length]
-        sent = sent[ends + 1 + length :]
 
 
 def test_a_page_of_many_cars_subscribes_within_the_limit_of_a_request(open_page, serve):

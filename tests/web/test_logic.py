@@ -1,4 +1,4 @@
-"""The page's own tests of what it does without a browser, and what its driver sends as the robot reads it."""
+"""The page's own tests of what it does without a browser, and what it sends as the robot reads it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import sys
 from pathlib import Path
 
 from iort_contract.messages.commands import check_by, decode_command
+from iort_contract.messages.video import LOOKS, decode_look
 from local.deployment import ROOT
 
 
-def test_the_page_passes_its_own_tests_and_the_robot_reads_its_commands(tmp_path):
+def test_the_page_passes_its_own_tests_and_the_robot_reads_what_it_sends(tmp_path):
     wire = tmp_path / "wire.json"
     done = subprocess.run(
         [Path(sys.executable).with_name("node"), "station/web/test.mjs"],
@@ -28,3 +29,5 @@ def test_the_page_passes_its_own_tests_and_the_robot_reads_its_commands(tmp_path
     assert {command.by for command in commands} == {"ada"}
     assert len(commands) > 100
     assert [check_by(name) for _, name in sent["names"]] == [name for _, name in sent["names"]]
+    looks = json.loads(wire.with_name("wire.json.looks").read_text())
+    assert {decode_look(json.dumps(look).encode()).kind for look in looks} == set(LOOKS)

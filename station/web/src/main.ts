@@ -15,6 +15,7 @@ import { observer } from "./live/observer";
 import { Registry } from "./live/registry";
 import { invited, readOnly } from "./server/admission";
 import { load } from "./server/config";
+import { PicturePanel } from "./video/panel";
 import { AlarmsView } from "./views/alarms";
 import { CarView } from "./views/car";
 import { CloudWatchView } from "./views/cloudwatch";
@@ -54,6 +55,7 @@ class Page {
   private readonly bar: StatusBar;
   private readonly views: Views;
   private readonly stops: StopControl;
+  private readonly picture: PicturePanel;
   private readonly drive: DrivePanel;
   private readonly stage = byId("stage");
   private readonly ignored = el("p", { class: "ignored", role: "status", hidden: "" });
@@ -79,9 +81,13 @@ class Page {
     this.stops = new StopControl(
       config,
       (robot) => this.registry.presence(robot)?.online,
-      () => this.drive?.show(),
+      () => {
+        this.picture?.show();
+        this.drive?.show();
+      },
     );
-    this.drive = new DrivePanel(config, this.stops.stops);
+    this.picture = new PicturePanel(config, this.stops.stops);
+    this.drive = new DrivePanel(config, this.stops.stops, this.picture);
     const alarms = new Alarms(config, this.fleet, table);
     this.bar = new StatusBar(config, this.fleet, alarms, this.viewing, table);
     const services: Services = {
@@ -92,6 +98,7 @@ class Page {
       alarms,
       stops: this.stops,
       drive: this.drive,
+      picture: this.picture,
       changed: () => this.arrange(),
     };
     this.views = Object.fromEntries(
@@ -146,6 +153,7 @@ class Page {
     this.registry.watch(view === "fleet" || view === "car");
     const car = view === "car" ? this.robot : undefined;
     this.stops.of(car);
+    this.picture.of(car);
     this.drive.of(car);
     next.show(this.route);
     this.look();

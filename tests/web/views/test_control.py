@@ -93,7 +93,7 @@ def test_a_command_is_sent_and_its_answer_shown(open_page, invite, robot, car):
     page.get_by_role("button", name="Send").click()
     until(lambda: "No answer within 10 s" in said.inner_text(), "the end of the wait")
     assert robot.sent[2] == {"robot": "car-1", "command": "horn", "lease_ms": "", "message": {"data": True}}
-    page.get_by_label("Blind").check()
+    page.get_by_label("Blind", exact=True).check()
     page.fill("[name=command]", "nothing")
     page.get_by_role("button", name="Send").click()
     until(lambda: said.inner_text() == "there is no such command", "the server's refusal")

@@ -12,6 +12,7 @@ import { button, el, newName, onPress, panel, setAttribute, setText, Text } from
 import { capital, NOTHING, number } from "../base/format";
 import { keep, kept } from "../base/kept";
 import { may } from "../server/admission";
+import type { PicturePanel } from "../video/panel";
 import { driverName } from "./command";
 import { Driver } from "./driver";
 import { Inputs } from "./inputs";
@@ -32,6 +33,7 @@ const WORDS = {
 const STICK = "Stick: up is ahead";
 const HELP =
   "Keys: hold Space, steer with the arrows or WASD, Escape leaves. Gamepad: hold L1 or R1. Mouse: drag the stick. Touch: hold the button, and move the stick. Letting go stops the car, and it stands until you leave the wheel.";
+const BLIND = "Drive blind: without the picture. The car records it with every command.";
 const UNHEARD = "The car does not hear you: others may drive it, also a planner on board.";
 
 /** What a viewer has while at the wheel. */
@@ -61,6 +63,9 @@ export class DrivePanel {
     maxlength: "64",
     autocomplete: "name",
   });
+  // Off for every wheel that is taken, and never kept.
+  private readonly blind = el("input", { type: "checkbox", name: "blind" });
+  private readonly blindly = el("label", { class: "drive-blind" }, this.blind, BLIND);
   private readonly figures = {
     rtt: figure("Round trip"),
     age: figure("Newest sample"),
@@ -75,16 +80,20 @@ export class DrivePanel {
   constructor(
     private readonly config: Config,
     private readonly stops: Stops,
+    private readonly picture: PicturePanel,
   ) {
     this.name.value = kept("name") ?? "";
     this.name.addEventListener("change", () => keep("name", this.name.value));
     onPress(this.over, () => this.takeOver());
     this.over.addEventListener("blur", () => (this.sure = false));
     this.top.addEventListener("input", () => this.topped());
+    // The next Space drives, and does not uncheck it.
+    this.blind.addEventListener("change", () => this.hold.focus({ preventScroll: true }));
     const limits = el(
       "div",
       { class: "drive-limits" },
       el("label", {}, el("span", {}, "Top speed ", this.topWords.node), this.top),
+      this.blindly,
       ...Object.values(this.figures).map(({ node }) => node),
     );
     const help = el("p", { class: "note drive-help" }, HELP);
@@ -123,7 +132,10 @@ export class DrivePanel {
     if (robot === undefined || !motion?.drive) return;
     const limits = motion.drive;
     const by = driverName(this.name.value, this.stops.user);
-    const driver = new Driver(limits, by, newName);
+    const { video } = motion;
+    const driver = new Driver(limits, by, newName, video?.max_age_ms);
+    [this.blind.checked, this.blindly.hidden] = [false, !video];
+    if (video) this.picture.open();
     this.top.max = String(limits.max_speed_mps);
     this.top.value = String(Math.min(limits.max_speed_mps, Number(kept("drive.top") ?? FIRST_TOP_MPS)));
     const inputs = new Inputs(
@@ -132,19 +144,22 @@ export class DrivePanel {
       () => this.held(),
       () => this.exit(),
     );
-    const socket = new DriveSocket(this.config.namespace, robot, {
-      message: (topic, payload) => {
+    const socket = new DriveSocket(
+      this.config.namespace,
+      robot,
+      (topic, payload) => {
         const message = readLive(topic, payload);
         if (message) driver.hear(message, now() * 1000);
       },
-      state: (reason) => driver.block(reason),
-    });
+      (reason) => driver.block(reason),
+    );
     driver.block("Connecting …");
     const timer = window.setInterval(() => this.tick(), TICK_S * 1000);
     this.wheel = { driver, inputs, socket, limits, timer };
     this.topped();
     this.arranged();
     this.hold.focus({ preventScroll: true });
+    if (video) this.picture.reveal();
   }
 
   private exit(): void {
@@ -158,6 +173,7 @@ export class DrivePanel {
       wheel.socket.send(wheel.limits.command, command);
     wheel.socket.close();
     this.wheel = undefined;
+    this.picture.meaning = "";
     this.who.set("");
     this.over.hidden = true;
     this.arranged();
@@ -193,6 +209,11 @@ export class DrivePanel {
     // Only a gamepad's button is read here.
     if (inputs.held !== before) driver.hold(inputs.held, at * 1000);
     driver.halt(this.stops.of(this.robot!)?.asked === true);
+    driver.blind = this.blind.checked;
+    driver.hide(document.hidden);
+    const seen = this.picture.seen();
+    driver.see(seen?.number, seen?.age_ms, at * 1000);
+    this.picture.meaning = driver.blind ? "you drive blind" : "driving has ended";
     const command = driver.tick(at * 1000);
     if (command) socket.send(limits.command, command);
     this.draw(at * 1000);

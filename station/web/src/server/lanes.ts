@@ -80,6 +80,7 @@ const LANES: Readonly<Record<string, Pick<Lane, "run">>> = {
   key: AT_ONCE,
   motion: SOON,
   view: SOON,
+  socket: SOON,
 };
 
 export const laneOf = (name: string): Pick<Lane, "run"> =>

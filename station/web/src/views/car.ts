@@ -60,7 +60,7 @@ export class CarView implements View<RouteTo<"car">> {
   private screens = new Ring(2, SCREENS, MEDIAN_S);
 
   constructor(private readonly services: Services) {
-    const { config, table, drive, changed } = services;
+    const { config, table, drive, picture, changed } = services;
     this.asks = asks(config);
     this.past = new Past(config);
     this.waterfall = new Waterfall(config);
@@ -81,7 +81,7 @@ export class CarView implements View<RouteTo<"car">> {
       el("header", { class: "car-head" }, this.heading.node, this.state.node, this.fault, this.links),
       this.malformed.node,
       this.gaugeRow,
-      drive.node,
+      el("div", { class: "cockpit" }, picture.node, drive.node),
       this.tools.node,
       el(
         "div",

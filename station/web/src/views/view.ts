@@ -9,6 +9,7 @@ import type { Looks } from "../link/viewing";
 import type { Alarms } from "../live/alarms";
 import type { Fleet } from "../live/fleet";
 import type { Registry } from "../live/registry";
+import type { PicturePanel } from "../video/panel";
 import type { Speed } from "../widgets/status_bar";
 
 /** What the page has for its views. */
@@ -20,6 +21,7 @@ export interface Services {
   readonly alarms: Alarms;
   readonly stops: StopControl;
   readonly drive: DrivePanel;
+  readonly picture: PicturePanel;
   /** The view has other contents: the page arranges it again. */
   readonly changed: () => void;
 }

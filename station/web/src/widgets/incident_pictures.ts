@@ -4,8 +4,9 @@
 import type { IncidentPicture } from "../base/contract";
 import { el } from "../base/dom";
 import { number } from "../base/format";
+import { draw } from "../base/jpeg";
 import { ask } from "../server/answers";
-import { bitmapOf, draw } from "./thumbnail";
+import { thumbnailOf } from "./thumbnail";
 
 const [WIDTH, HEIGHT, MARGIN] = [160, 90, 6];
 const MOST_KNOWN = 500;
@@ -67,7 +68,7 @@ export class IncidentPictures {
 /** Fill the place; without a picture it goes. */
 async function show(node: HTMLElement, picture: IncidentPicture, label: string): Promise<void> {
   const { jpeg, topic, after_s, field, times_s, values } = picture;
-  const bitmap = jpeg ? await bitmapOf(jpeg) : undefined;
+  const bitmap = jpeg ? await thumbnailOf(jpeg) : undefined;
   if (bitmap) {
     const when = `${Math.abs(after_s).toFixed(2)} s ${after_s < 0 ? "before" : "after"}`;
     const canvas = el("canvas", { role: "img", "aria-label": `${label}: ${topic}, ${when} the edge` });
