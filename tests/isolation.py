@@ -406,4 +406,7 @@ TOPICS = (
     build_topic(ANSWER, B, CALIBRATION.name),
     build_topic(ANSWER, B, "nobody"),
     build_topic(ANSWER, B, CALIBRATION.name, "lab2"),
+    look_topic(B, "iort"),
+    answer_topic(B, ME, "iort"),
+    picture_topic(B, "iort"),
 )
