@@ -113,8 +113,9 @@ class VideoConfig:
     A picture of another shape keeps its shape, between black bars. ``rate_hz`` is the highest rate.
     A motion command whose driver saw a picture older than ``max_age_ms`` is refused. Viewers without WebRTC
     get ``pictures_hz`` small pictures a second over the broker. ``codec: gstreamer`` encodes by ``pipeline``,
-    GStreamer elements that take raw I420 and give H.264, for example `nvvidconv ! nvv4l2h264enc`; ``{kbps}``,
-    ``{bps}`` and ``{rate}`` in it become the bitrate in kbit/s or bit/s, and the pictures a second.
+    GStreamer elements that take raw I420 and give H.264 at once, for example `nvvidconv ! nvv4l2h264enc` on a
+    Jetson (not tried on one); ``{kbps}``, ``{bps}`` and ``{rate}`` in it become the bitrate in kbit/s or
+    bit/s, and the pictures a second.
     """
 
     source: TopicCamera | V4l2Camera | SimCamera = setting(variant("type", CAMERAS))

@@ -171,7 +171,7 @@ def _edges(track: Track, size_m: float) -> list[_Edge]:
         for i in range(n)
     ]
     # An even number, so that the colours alternate over the start, too.
-    panels = 2 * min(_MOST_PANELS, max(4, round(sum(lengths) / (_PANEL * size_m)))) // 2
+    panels = min(_MOST_PANELS, max(4, round(sum(lengths) / (_PANEL * size_m)))) // 2 * 2
     edges, i, passed = [], 0, 0.0
     for k in range(panels):
         at = k * sum(lengths) / panels

@@ -132,7 +132,6 @@ def test_a_password_that_is_gone_is_an_error(tmp_path: Path) -> None:
         TurnConfig("turn:x", "a", tmp_path / "turn.password").server()
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # aiortc 1.9 on Python 3.8
 def test_the_check_tells_who_may_read_the_password(folder: Path) -> None:
     video = load(
         folder,

@@ -66,6 +66,15 @@ def test_each_place_of_the_track_looks_its_own_way() -> None:
     assert len(seen) == len(range(0, CIRCUIT.steps, 3)), "motion is visible"
 
 
+@pytest.mark.parametrize("size_m", [0.33, 0.37, 0.02, 2.5, 20.0])
+def test_the_panels_colours_alternate_over_the_start_too(size_m: float) -> None:
+    edges = Hall(HALL, size_m, 320, 240)._edges
+    assert 4 <= len(edges) <= 400
+    assert len(edges) % 2 == 0
+    for left, right in edges:
+        assert math.dist(left, right) == pytest.approx(2.2, abs=0.05), "the track's width"
+
+
 @pytest.mark.parametrize("away_m", [5.0, 1e3, 1e6])
 def test_a_car_that_left_the_track_still_sees(away_m: float) -> None:
     picture = hall().draw(Pose(away_m, -away_m, 1.0), 3, NOW_US)
