@@ -383,6 +383,7 @@ class Lab:
             "raceline": lambda _: {"x_m": [], "y_m": [], "lap_s": 0.0, "reason": "the page has no track"},
             "motion": self.motion,
             "socket": self.socket,
+            "ice": lambda _: {"ice_servers": []},
             "laps": of_laps(analysis.laps),
             "delta": of_laps(analysis.delta),
             "dashboards": lambda _: {"dashboards": ["iort-platform"]},

@@ -13,6 +13,7 @@ import {
   decodeMarks,
   decodePicture,
   decodeShow,
+  type IceServer,
   topicsOf,
 } from "../src/video/messages";
 import type { PeerEnds } from "../src/video/peer";
@@ -145,6 +146,9 @@ class Rig {
   readonly peers: FakePeer[] = [];
   readonly heard = new Set<string>();
   readonly sent: Record<string, string>[] = [];
+  /** The servers of each session. */
+  readonly given: (readonly IceServer[])[] = [];
+  servers: () => Promise<readonly IceServer[]> = async () => [];
   private names = 0;
   readonly sight: Sight;
 
@@ -156,8 +160,10 @@ class Rig {
         looks.push(message);
       },
       hear: (topic, heard) => void (heard ? this.heard.add(topic) : this.heard.delete(topic)),
+      servers: () => this.servers(),
       peer: webrtc
-        ? (_servers, ends) => {
+        ? (servers, ends) => {
+            this.given.push(servers);
             const peer = new FakePeer(ends);
             this.peers.push(peer);
             return peer;
@@ -305,6 +311,36 @@ describe("a viewer", () => {
     rig.say("ask", { kind: "refused", why: "the camera is unplugged" });
     assert.equal(rig.sight.words, "the camera is unplugged");
     await rig.terms();
+  });
+
+  test("asks for the deployment's relays before each offer, and tells the car of them", async () => {
+    const rig = new Rig();
+    const relay = (credential: string): IceServer => ({
+      urls: ["turn:a.example"],
+      username: "u",
+      credential,
+    });
+    const own = { urls: ["stun:car.example"], username: "", credential: "" };
+    rig.servers = async () => [relay(`${rig.given.length}`)];
+    rig.say("ask", { kind: "terms", terms: TERMS, ice_servers: [own] });
+    rig.tick();
+    rig.tick();
+    await rig.settled();
+    rig.peer.ends.failed("the connection failed");
+    await rig.pass(5_200);
+    assert.deepEqual(rig.given, [
+      [relay("0"), own],
+      [relay("1"), own],
+    ]);
+    assert.deepEqual(rig.newest("offer").ice_servers, [relay("1")]);
+  });
+
+  test("offers without relays if there are none now", async () => {
+    const rig = new Rig();
+    rig.servers = () => Promise.reject(new Error("no relay for video"));
+    await rig.terms();
+    assert.deepEqual(rig.given, [[]]);
+    assert.equal(rig.newest("offer").ice_servers, undefined);
   });
 
   for (const [what, happens] of Object.entries({

@@ -1,7 +1,7 @@
 // The picture of a car's camera, in its view: looked at by a button, or by taking the wheel. Its age is always over it.
 
 import { now } from "../base/clock";
-import type { Config, SocketAnswer, VideoTermsEntry } from "../base/contract";
+import type { Config, IceAnswer, SocketAnswer, VideoTermsEntry } from "../base/contract";
 import { button, el, newName, panel, setAttribute, setText, Text } from "../base/dom";
 import { age, capital, NOTHING, number } from "../base/format";
 import { bitmapOf, draw } from "../base/jpeg";
@@ -14,6 +14,8 @@ import { Screen } from "./screen";
 import { Sight, type Sighted, type Way } from "./sight";
 
 const TICK_MS = 100;
+/** Without an answer by then a session begins without relays. */
+const SERVERS_MS = 3_000;
 const FIGURES_MS = 1_000;
 const MOST_PIXELS = 4096;
 // Less of it is not on the screen.
@@ -171,6 +173,7 @@ export class PicturePanel {
     const sight: Sight = new Sight(topicsOf(this.config.namespace, robot), {
       send: (topic, message) => broker.send(topic, message),
       hear: (topic, heard) => broker.hear(topic, heard),
+      servers: async () => (await ask<IceAnswer>("ice", {}, AbortSignal.timeout(SERVERS_MS))).ice_servers,
       peer: able() ? (servers, ends) => new Peer(servers, this.video, ends) : undefined,
       draw: async (jpeg) => {
         const bitmap = await bitmapOf(jpeg, MOST_PIXELS);

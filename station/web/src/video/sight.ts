@@ -43,6 +43,8 @@ export type Way = "webrtc" | "broker";
 export interface Eyes {
   readonly send: (topic: string, message: object) => void;
   readonly hear: (topic: string, heard: boolean) => void;
+  /** STUN and TURN servers of the deployment, for a session that begins now. */
+  readonly servers: () => Promise<readonly IceServer[]>;
   /** A new WebRTC session; undefined if this browser has none. */
   readonly peer:
     | ((
@@ -105,8 +107,6 @@ export class Sight {
   otherwise = "";
   /** Whether a picture was shown since the viewer looks. */
   had = false;
-  /** STUN and TURN servers of the deployment. */
-  servers: readonly IceServer[] = [];
   private readonly viewer: string;
   private works = false;
   private request = "";
@@ -122,6 +122,7 @@ export class Sight {
   private smallAt_ms = -Infinity;
   private renewed_ms = -Infinity;
   private echoed_ms = -Infinity;
+  private dialing = false;
   private decoding = false;
   private closed = false;
 
@@ -174,7 +175,7 @@ export class Sight {
     // Each answer also tells how long the way over the broker is.
     if (at >= this.askAt_ms) this.ask(at);
     if (this.terms) {
-      if (!this.rtc && at >= this.rtcAt_ms) void this.dial(at);
+      if (!this.rtc && !this.dialing && at >= this.rtcAt_ms) void this.dial();
       this.instead(at);
     }
     if (at - this.renewed_ms >= VIEW_RENEW_S * 1000) {
@@ -260,13 +261,20 @@ export class Sight {
     }
   }
 
-  private async dial(at: number): Promise<void> {
+  private async dial(): Promise<void> {
+    this.dialing = true;
+    // Without them a session may still be possible, directly.
+    const deployed = await this.eyes
+      .servers()
+      .catch((): readonly IceServer[] => [])
+      .finally(() => (this.dialing = false));
+    if (this.closed || !this.works) return;
     const session = { viewer: this.eyes.newName(), request: this.eyes.newName(), kept: "" };
-    const servers = [...this.servers, ...this.offered];
+    const servers = [...deployed, ...this.offered];
     const { ends, known } = this.ends();
     const rtc: Rtc = {
       ...session,
-      began_ms: at,
+      began_ms: this.eyes.now_ms(),
       seen: undefined,
       clock: new RobotClock(),
       peer: this.eyes.peer!(servers, ends),
@@ -282,7 +290,7 @@ export class Sight {
       const sdp = await rtc.peer.offer();
       if (this.rtc !== rtc) return;
       const { viewer, request } = rtc;
-      const ice_servers = this.servers.length > 0 ? { ice_servers: this.servers } : {};
+      const ice_servers = deployed.length > 0 ? { ice_servers: deployed } : {};
       this.look({ viewer, request, kind: "offer", sdp, ...ice_servers });
     } catch (error) {
       this.fail(rtc, String(error));
