@@ -116,7 +116,7 @@ class Viewer:
 
     def _heard(self, _topic: str, payload: bytes) -> None:
         try:
-            show = decode_show(json.loads(payload))
+            show = decode_show(payload)
         except ContractError as error:
             raise InstrumentError(f"the robot's answer breaks the contract: {error}") from error
         self.heard.append(show)

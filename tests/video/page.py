@@ -106,6 +106,7 @@ class Viewer:
             # Without a graphics card, smooth charts take a core.
             self._page.emulate_media(reduced_motion="reduce")
             self._page.goto(scene.server.invitation(f"#/car/{scene.robot}"))
+            self._page.get_by_role("button", name="Look", exact=True).click()
             self._exit = stack.pop_all()
         return self
 

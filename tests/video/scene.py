@@ -63,8 +63,8 @@ SETTINGS: dict[str, Any] = {
 class Receiver:
     """A viewer by aiortc in a process of its own, from `__enter__` to `__exit__`."""
 
-    def __init__(self, scene: Scene, robot: str) -> None:
-        command = [sys.executable, "-m", "tests.video.receiver", "--robot", robot]
+    def __init__(self, scene: Scene) -> None:
+        command = [sys.executable, "-m", "tests.video.receiver", "--robot", scene.robot]
         command += ["--embedded", str(scene.embedded.folder / EMBEDDED.name)]
         self._process = Process(scene.there(*command), dict(os.environ))
 
