@@ -102,8 +102,8 @@ bench: setup ## measure every table of the thesis, or others: ONLY=query,outage 
 		$(foreach name,$(BENCH_OPTIONS),$(if $($(name)),--set "$(name)=$($(name))")) $(if $(TARGET),--target $(TARGET)) \
 		$(if $(YES),--yes) $(if $(OUT),--out $(OUT)) $(if $(NAMESPACE),--namespace $(NAMESPACE))
 
-screenshots: setup ## take the pictures of docs/images anew
-	@$(BIN)/python -m bench.screenshots
+screenshots: setup ## take the pictures of docs/images anew: ONLY=video
+	@$(BIN)/python -m bench.screenshots $(ONLY)
 
 verify-aws: layer ## ask your AWS account what the design rests on: ONLY=rules,files YES=1 KEEP=1 BY=name
 	@$(BIN)/python -m verify.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \

@@ -15,10 +15,21 @@ from local.figures import Spread
 
 class Shown(NamedTuple):
     """A picture on a viewer's screen: when, by the machine's clock, and its number as the picture shows it;
-    None if it cannot be read."""
+    None if it cannot be read. ``held_ms`` is how long the viewer had its last packet by then, if that is
+    known."""
 
     shown_us: int
     number: int | None
+    held_ms: float | None = None
+
+
+class Said(NamedTuple):
+    """What the page itself says beside the picture: its state, the picture's number, and its age."""
+
+    at_us: int
+    state: str
+    number: int
+    age_ms: float
 
 
 class Motion(NamedTuple):
@@ -100,6 +111,19 @@ def again_s(shown: Sequence[Shown], captured: Mapping[int, int], at_us: int, lim
     return None
 
 
+def said_again_s(said: Sequence[Said], captured: Mapping[int, int], at_us: int) -> float | None:
+    """After how long the page called a picture live that was captured after ``at_us``; None if it did not."""
+    for one in said:
+        if one.at_us >= at_us and one.state == "live" and captured.get(one.number, 0) >= at_us:
+            return (one.at_us - at_us) / 1e6
+    return None
+
+
+def said_wrong_ms(said: Sequence[Said], captured: Mapping[int, int]) -> list[float]:
+    """By how much each age that the page told is more than the true age of its picture."""
+    return [one.age_ms - (one.at_us - captured[one.number]) / 1000 for one in said if one.number in captured]
+
+
 def longest_gap_ms(shown: Sequence[Shown], span: tuple[int, int]) -> float:
     """The longest time without a new picture."""
     times = [span[0], *(one.shown_us for one in shown if span[0] < one.shown_us < span[1]), span[1]]
@@ -123,13 +147,15 @@ def judge(
     limit_ms: float,
     span: tuple[int, int],
     *,
+    screen_ms: float = 0.0,
     slack_ms: float = 0.0,
 ) -> Verdict:
     """Judge the commands of a time. ``last_ms`` is when the last one passed, from its begin.
 
     By the robot's word: the picture was known, and not late. By the screen, which the robot does not see: the
-    picture that the command names was on it, and the newest there was not late by the time the command came,
-    within ``slack_ms`` for the clock of the browser.
+    picture that the command names was on it, and the newest there was not late when the command came.
+    ``screen_ms`` is how exactly a browser tells when a picture is on the screen, ``slack_ms`` how exactly
+    a sample tells when its command came.
     """
     on_screen: dict[int, int] = {}
     for one in shown:
@@ -148,9 +174,9 @@ def judge(
         else:
             if one.frame_age_ms > limit_ms:
                 why.append(f"its picture was {one.frame_age_ms:.0f} ms old")
-            if on_screen.get(one.frame, one.at_us + 1) > one.at_us + slack_ms * 1000:
+            if on_screen.get(one.frame, 2**63) > one.at_us + screen_ms * 1000:
                 why.append(f"picture {one.frame} was not on the screen")
-        last = bisect_right(newest, (one.at_us + round(slack_ms * 1000), 2**63)) - 1
+        last = bisect_right(newest, (one.at_us + round(screen_ms * 1000), 2**63)) - 1
         seen = newest[last][1] if last >= 0 else None
         age_ms = (one.at_us - captured[seen]) / 1000 if seen in captured else None
         if age_ms is None or age_ms > limit_ms + slack_ms:

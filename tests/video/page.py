@@ -16,7 +16,7 @@ from iort_contract.counter import CHECK_BITS, COLUMNS, HEIGHTS, NUMBER_BITS, ROW
 from testkit.chromium import Tabs
 from testkit.proxy import Proxy
 from testkit.waiting import GUARD_S, InstrumentError, until
-from tests.video.account import Shown
+from tests.video.account import Said, Shown
 from tests.video.scene import Scene, port_of
 
 _START_MS = GUARD_S * 1000
@@ -24,7 +24,7 @@ _START_MS = GUARD_S * 1000
 READER = """
 (() => {
   const [columns, rows, heights, numberBits, checkBits] = LAYOUT;
-  window.shownPictures = [];
+  [window.shownPictures, window.panelSays] = [[], []];
   window.peers = [];
   const Peer = window.RTCPeerConnection;
   window.RTCPeerConnection = class extends Peer {
@@ -37,12 +37,11 @@ READER = """
   }, 0xffff);
   const canvas = document.createElement("canvas");
   const pen = canvas.getContext("2d", { willReadFrequently: true });
-  const number = (video) => {
-    const { videoWidth: width, videoHeight: height } = video;
+  const number = (picture, width, height) => {
     const strip = Math.round(rows * height / heights);
     if (!strip) return null;
     [canvas.width, canvas.height] = [width, strip];
-    pen.drawImage(video, 0, height - strip, width, strip, 0, 0, width, strip);
+    pen.drawImage(picture, 0, height - strip, width, strip, 0, 0, width, strip);
     const { data } = pen.getImageData(0, 0, width, strip);
     let bits = "";
     for (let row = 0; row < rows; row++) {
@@ -65,14 +64,29 @@ READER = """
     const look = (now, about) => {
       // The picture is on the screen at that time, which is soon.
       const soon = Math.max(0, about.expectedDisplayTime - performance.now());
-      window.shownPictures.push([Math.round((Date.now() + soon) * 1000), number(video)]);
+      const received = about.receiveTime === undefined ? null : now - about.receiveTime;
+      const at = Math.round((Date.now() + soon) * 1000);
+      const read = number(video, video.videoWidth, video.videoHeight);
+      window.shownPictures.push([at, read, received === null ? null : received + soon]);
       video.requestVideoFrameCallback(look);
     };
     video.requestVideoFrameCallback(look);
   };
   setInterval(() => {
     for (const video of document.querySelectorAll("video")) if (!followed.has(video)) follow(video);
+    const panel = document.querySelector("[data-on]");
+    const age = panel?.querySelector(".sight-age")?.textContent.replace(/[^0-9]/g, "");
+    if (age) window.panelSays.push([Date.now() * 1000, panel.dataset.state, +panel.dataset.frame, +age]);
   }, 50);
+  // Pictures over the broker tell nobody when they are there.
+  let newest = null;
+  const compare = () => {
+    requestAnimationFrame(compare);
+    const drawn = document.querySelector("[data-on][data-way=broker] canvas");
+    const read = drawn && number(drawn, drawn.width, drawn.height);
+    if (read && read !== newest) window.shownPictures.push([Date.now() * 1000, newest = read, null]);
+  };
+  requestAnimationFrame(compare);
 })();
 """.replace("LAYOUT", str([COLUMNS, ROWS, HEIGHTS, NUMBER_BITS, CHECK_BITS]))
 STATS = """async () => Promise.all(window.peers.filter((one) => one.connectionState === "connected")
@@ -88,6 +102,7 @@ class Viewer:
         self._play: Playwright
         self._browser: Browser
         self._shown: list[Shown] = []
+        self.said: list[Said] = []
         self._page: Page
         self.tabs: Tabs
 
@@ -133,7 +148,9 @@ class Viewer:
         return self._page
 
     def _look(self) -> None:
-        self._shown += [Shown(at, number) for at, number in self._page.evaluate("shownPictures.splice(0)")]
+        news = self._page.evaluate("[shownPictures.splice(0), panelSays.splice(0)]")
+        self._shown += [Shown(*one) for one in news[0]]
+        self.said += [Said(*one) for one in news[1]]
 
     @property
     def shown(self) -> list[Shown]:

@@ -26,6 +26,7 @@ from local.figures import Spread
 from testkit.waiting import GUARD_S, InstrumentError, until
 from tests.video.account import (
     Motion,
+    Said,
     Shown,
     Verdict,
     again_s,
@@ -34,6 +35,8 @@ from tests.video.account import (
     live_share,
     longest_gap_ms,
     motions,
+    said_again_s,
+    said_wrong_ms,
 )
 from tests.video.page import Viewer
 from tests.video.scene import LEASE_S, LIMIT_MS, Receiver, Scene
@@ -41,17 +44,23 @@ from tests.video.scene import LEASE_S, LIMIT_MS, Receiver, Scene
 CHROMIUM, AIORTC = "Chromium", "aiortc"
 # From the capture to the screen, by the round trip.
 TARGETS_MS = {0: 120.0, 50: 250.0}
-CUT_S, RECOVERY_S, LOSS = 5.0, 2.0, 0.05
+CUT_S, RECOVERY_S = 5.0, 2.0
+# The networks, by what is told of them; and a line that becomes half as wide while somebody looks.
+NETWORKS: dict[str, dict[str, Any]] = {"0 ms": {}, "50 ms": {"delay_ms": 25.0}, "5 % loss": {"loss": 0.05}}
+LINE, HALF, LINE_KBIT_S = "1 Mbit/s", "halved to 500 kbit/s", 1000.0
+# So many pictures after a cut tell that they are back.
+_BACK = 10
 ENCODER, NETWORK, TAB, THREAD = "encoder stopped", "network cut", "tab hidden", "video thread killed"
 # How long a failure lasts: longer than the picture's limit and the lease together.
 FROZEN_S = LIMIT_MS / 1000 + LEASE_S + 0.8
-# The browser's clock has whole milliseconds, and tells when a picture will be on the screen.
-SLACK_MS = 20.0
+# A browser tells when a picture will be on the screen: some periods of the screen. A sample is made after
+# its command came.
+SCREEN_MS, SLACK_MS = 50.0, 20.0
 # A hold that a slow machine ends before the failure is no try.
 _VOID = 3
 _WARM_UP_S = 3.0
 # Before a failure, so that commands have passed.
-_DRIVEN_S = 0.6
+_DRIVEN_S, _SEEN_US = 0.6, 3_000_000
 
 
 class Stretch(NamedTuple):
@@ -61,7 +70,6 @@ class Stretch(NamedTuple):
     viewer: str
     span: tuple[int, int]
     kbit_s: float
-    conditions: str
 
 
 @dataclass
@@ -79,11 +87,14 @@ class Try:
 @dataclass
 class Figures:
     """What the proof found. ``glass`` is the age of pictures on the screen, by viewer and round trip in ms;
-    ``recovery_s`` the time from the end of a cut to a live picture, None if none came; ``bad`` the pictures
-    on bad networks; ``lanes`` the p50 of the delays in ms, by block and lane."""
+    ``recovery_s`` the time from the end of a cut to a live picture, None if none came; ``page_again_s`` the
+    same by the page's own word, and ``age_wrong_ms`` by how much the age that it tells is too high; ``bad``
+    the pictures on bad networks; ``lanes`` the delays in ms, by block and lane."""
 
     glass: dict[str, dict[int, Spread]] = field(default_factory=dict)
     recovery_s: dict[str, list[float | None]] = field(default_factory=dict)
+    page_again_s: list[float | None] = field(default_factory=list)
+    age_wrong_ms: Spread = field(default_factory=lambda: Spread.of([]))
     bad: list[dict[str, Any]] = field(default_factory=list)
     tries: list[Try] = field(default_factory=list)
     whole: Verdict | None = None
@@ -104,6 +115,7 @@ class Proof:
         self._captured: dict[int, int] = {}
         self._stretches: list[Stretch] = []
         self._shown: dict[str, list[Shown]] = {}
+        self._said: list[Said] = []
         self._cut_ends: dict[str, list[int]] = {}
         self._pause = Event()
 
@@ -123,7 +135,7 @@ class Proof:
             viewer.sit()
             for failure in (ENCODER, NETWORK, TAB, THREAD):
                 self._try(viewer, failure)
-            self._shown[CHROMIUM] = viewer.shown
+            self._shown[CHROMIUM], self._said = viewer.shown, viewer.said
         self._account(began_us)
 
     # --- looking -----------------------------------------------------------------------------------
@@ -132,17 +144,13 @@ class Proof:
         self, name: str, shown: Callable[[], Sequence[Shown]], after: Callable[[], None] = lambda: None
     ) -> None:
         """Look on each network, and through cuts."""
-        networks: dict[str, dict[str, Any]] = {"0 ms": {}}
-        if self.scene.wire is not None:
-            networks["50 ms"] = {"delay_ms": 25.0}
-            networks["5 % loss"] = {"loss": LOSS}
-        for what, conditions in networks.items():
-            self._stretch(what, name, conditions, shown)
-            after()
+        for what, conditions in NETWORKS.items():
+            if not conditions or self.scene.wire is not None:
+                self._stretch(what, name, conditions, shown)
+                after()
         if self.scene.wire is None:
             return
-        used = self._stretches[-len(networks)].kbit_s
-        self._stretch("half the bandwidth", name, {"kbit_s": max(60.0, used / 2)}, shown)
+        self._stretch(LINE, name, {"kbit_s": LINE_KBIT_S}, shown, more=(HALF, {"kbit_s": LINE_KBIT_S / 2}))
         after()
         for i in range(self._cuts):
             self._say(f"{name}: cut {i + 1} of {self._cuts}, {CUT_S:g} s")
@@ -151,22 +159,35 @@ class Proof:
             end_us = _now_us()
             self._cut_ends.setdefault(name, []).append(end_us)
             with _within(60.0):
-                until(lambda: any(one.shown_us > end_us for one in shown()), "a picture after the cut", 60.0)  # noqa: B023 - within the loop
+                until(lambda: sum(one.shown_us > end_us for one in shown()) > _BACK, "pictures", 60.0)  # noqa: B023 - within the loop
             self._pause.wait(_WARM_UP_S)
 
     def _stretch(
-        self, what: str, name: str, conditions: dict[str, Any], shown: Callable[[], Sequence[Shown]]
+        self,
+        what: str,
+        name: str,
+        conditions: dict[str, Any],
+        shown: Callable[[], Sequence[Shown]],
+        more: tuple[str, dict[str, Any]] | None = None,
     ) -> None:
-        self._say(f"{name}: {what} for {self._part_s:g} s")
+        """Look for a while, once the network is as it is; and with ``more`` from the moment at which it
+        becomes that."""
         before = len(shown())
         with self._network(**conditions):
             until(lambda: len(shown()) > before, f"a picture at {what}")
             self._pause.wait(_WARM_UP_S)
-            began_us, bytes_ = _now_us(), self._bytes()
-            self._pause.wait(self._part_s)
-            end_us = _now_us()
-            kbit_s = (self._bytes() - bytes_) * 8 / ((end_us - began_us) / 1000)
-        self._stretches.append(Stretch(what, name, (began_us, end_us), kbit_s, str(conditions)))
+            self._measured(what, name)
+            if more is not None:
+                self.scene.network(**more[1])
+                self._measured(more[0], name)
+
+    def _measured(self, what: str, name: str) -> None:
+        self._say(f"{name}: {what} for {self._part_s:g} s")
+        began_us, bytes_ = _now_us(), self._bytes()
+        self._pause.wait(self._part_s)
+        end_us = _now_us()
+        kbit_s = (self._bytes() - bytes_) * 8 / ((end_us - began_us) / 1000)
+        self._stretches.append(Stretch(what, name, (began_us, end_us), kbit_s))
 
     def _bytes(self) -> int:
         return self.scene.wire.counts()["bytes"] if self.scene.wire is not None else 0
@@ -204,9 +225,9 @@ class Proof:
             self._pause.wait(_DRIVEN_S)
             if not viewer.drives:
                 continue
-            at_us = _now_us()
             with ExitStack() as stack:
                 fail[failure](stack)
+                at_us = _now_us()
                 # The absence of commands has no event.
                 self._pause.wait(FROZEN_S)
                 mended_us = _now_us()
@@ -267,6 +288,7 @@ class Proof:
         commands = self._commands(began_us)
         for one in self._stretches:
             ages = ages_ms(self._shown[one.viewer], self._captured, one.span)
+            held = [each.held_ms for each in _during(self._shown[one.viewer], one.span) if each.held_ms]
             if one.name in ("0 ms", "50 ms"):
                 figures.glass.setdefault(one.viewer, {})[int(one.name.split()[0])] = Spread.of(ages)
             figures.bad.append(
@@ -276,6 +298,7 @@ class Proof:
                     "kbit_s": round(one.kbit_s),
                     "pictures_hz": round(len(ages) / ((one.span[1] - one.span[0]) / 1e6), 1),
                     "age_ms": asdict(Spread.of(ages)),
+                    "held_ms": asdict(Spread.of(held)),
                     "live_share": round(
                         live_share(self._shown[one.viewer], self._captured, one.span, LIMIT_MS), 3
                     ),
@@ -286,15 +309,24 @@ class Proof:
             figures.recovery_s[name] = [
                 again_s(self._shown[name], self._captured, end_us, LIMIT_MS) for end_us in ends
             ]
+        figures.page_again_s = [
+            said_again_s(self._said, self._captured, end_us) for end_us in self._cut_ends.get(CHROMIUM, ())
+        ]
+        live = [one for one in self._said if one.state == "live"]
+        figures.age_wrong_ms = Spread.of(said_wrong_ms(live, self._captured))
         shown = self._shown[CHROMIUM]
         for each in figures.tries:
             begin_us, end_us = each.span
-            each.driven = sum(one.passed for one in commands if begin_us - 1_000_000 <= one.at_us < begin_us)
-            each.verdict = judge(commands, shown, self._captured, LIMIT_MS, each.span, slack_ms=SLACK_MS)
+            each.driven = sum(one.passed for one in commands if begin_us - _SEEN_US <= one.at_us < begin_us)
+            each.verdict = judge(
+                commands, shown, self._captured, LIMIT_MS, each.span, screen_ms=SCREEN_MS, slack_ms=SLACK_MS
+            )
             each.gap_ms = longest_gap_ms(shown, (begin_us, end_us + 5_000_000))
             each.again_s = again_s(shown, self._captured, end_us, LIMIT_MS)
         whole = (began_us, _now_us())
-        figures.whole = judge(commands, shown, self._captured, LIMIT_MS, whole, slack_ms=SLACK_MS)
+        figures.whole = judge(
+            commands, shown, self._captured, LIMIT_MS, whole, screen_ms=SCREEN_MS, slack_ms=SLACK_MS
+        )
         assert scene.agent.alive()
 
     def _recorded(self) -> int:
@@ -310,6 +342,10 @@ class Proof:
     def _commands(self, began_us: int) -> list[Motion]:
         found = data.query(self.scene.cloud, self.scene.robot, DRIVE_STREAM, began_us, _now_us())
         return motions(list(found.times_us), found.columns)
+
+
+def _during(shown: Sequence[Shown], span: tuple[int, int]) -> list[Shown]:
+    return [one for one in shown if span[0] <= one.shown_us <= span[1]]
 
 
 def _now_us() -> int:

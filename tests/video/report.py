@@ -56,12 +56,22 @@ def _bad(figures: Figures) -> str:
             str(one["pictures_hz"]),
             _ms(one["age_ms"]["p50"]),
             _ms(one["age_ms"]["p95"]),
+            _ms(one["held_ms"]["p50"]),
             f"{one['live_share']:.1%}",
             _ms(one["longest_gap_ms"]),
         ]
         for one in figures.bad
     ]
-    head = ("viewer, network", "kbit/s", "a second", "age p50 ms", "p95 ms", "live", "longest gap ms")
+    head = (
+        "viewer, network",
+        "kbit/s",
+        "a second",
+        "age p50 ms",
+        "p95 ms",
+        "held ms",
+        "live",
+        "longest gap ms",
+    )
     return _table(f"Pictures by network; live is younger than {LIMIT_MS} ms", head, rows)
 
 
@@ -70,6 +80,9 @@ def _recovery(figures: Figures) -> str:
         [viewer, str(len(found)), "  ".join("never" if one is None else f"{one:.2f}" for one in found)]
         for viewer, found in figures.recovery_s.items()
     ]
+    if figures.page_again_s:
+        told = ["never" if one is None else f"{one:.2f}" for one in figures.page_again_s]
+        rows.append(["the page's own word", str(len(told)), "  ".join(told)])
     title = f"From the end of a cut to a live picture, in s; target {RECOVERY_S:g}"
     return _table(title, ("viewer", "cuts", "s"), rows) if rows else ""
 
@@ -101,7 +114,9 @@ def _tries(figures: Figures) -> str:
         "live again s",
     )
     whole = figures.whole
+    wrong = figures.age_wrong_ms
     told = f"{whole.passed} commands passed, {len(whole.wrong)} wrong" if whole else ""
+    told += f"; the page tells an age that is {_ms(wrong.p50)} ms too high (p95 {_ms(wrong.p95)}), {wrong.n}"
     return "\n".join([_table("Commands when the picture froze", head, rows), told])
 
 

@@ -6,7 +6,19 @@ import math
 
 import pytest
 
-from tests.video.account import Motion, Shown, again_s, ages_ms, judge, live_share, longest_gap_ms, motions
+from tests.video.account import (
+    Motion,
+    Said,
+    Shown,
+    again_s,
+    ages_ms,
+    judge,
+    live_share,
+    longest_gap_ms,
+    motions,
+    said_again_s,
+    said_wrong_ms,
+)
 
 LIMIT_MS = 500
 # Pictures 1 to 20, ten a second, each on the screen 80 ms after its capture.
@@ -20,8 +32,8 @@ def command(at_us: int, frame: int | None = None, **change: object) -> Motion:
     return Motion(at_us, 1, "accepted", frame, age_ms, blind=False, drives=True)._replace(**change)
 
 
-def wrong(*commands: Motion, slack_ms: float = 0.0) -> tuple[str, ...]:
-    return judge(commands, SHOWN, CAPTURED, LIMIT_MS, EVER, slack_ms=slack_ms).wrong
+def wrong(*commands: Motion, **settings: float) -> tuple[str, ...]:
+    return judge(commands, SHOWN, CAPTURED, LIMIT_MS, EVER, **settings).wrong
 
 
 def test_a_command_by_the_newest_picture_is_right() -> None:
@@ -50,8 +62,12 @@ def test_a_refused_command_and_one_that_ends_are_not_wrong() -> None:
     assert (verdict.passed, verdict.refused, verdict.wrong) == (0, 2, ())
 
 
-def test_the_browsers_clock_may_be_a_little_off() -> None:
-    assert wrong(command(1_075_000, 10), slack_ms=5) == ()
+def test_a_browser_tells_only_about_when_a_picture_is_on_the_screen() -> None:
+    assert wrong(command(1_075_000, 10), screen_ms=5) == ()
+    # That makes no late picture younger.
+    assert wrong(command(2_505_000, 20), screen_ms=50)
+    assert wrong(command(2_505_000, 20, frame_age_ms=499.0), screen_ms=50)
+    assert wrong(command(2_505_000, 20, frame_age_ms=499.0), slack_ms=10) == ()
 
 
 def test_only_the_commands_of_the_time_count() -> None:
@@ -73,6 +89,18 @@ def test_pictures_are_back_when_a_new_one_is_not_late() -> None:
     late = [Shown(3_000_000, 18), Shown(3_100_000, 19)]
     assert again_s(late, CAPTURED, 1_800_000, LIMIT_MS) is None
     assert again_s([*late, *SHOWN], CAPTURED, 1_850_000, LIMIT_MS) == pytest.approx(0.13)
+
+
+def test_the_pages_own_word_is_held_to_the_truth() -> None:
+    said = [
+        Said(1_000_000, "live", 9, 103.0),
+        Said(2_200_000, "frozen", 20, 190.0),
+        Said(2_300_000, "live", 20, 310.0),
+        Said(2_400_000, "live", 77, 1.0),
+    ]
+    assert said_wrong_ms(said, CAPTURED) == pytest.approx([3.0, -10.0, 10.0])
+    assert said_again_s(said, CAPTURED, 1_900_000) == pytest.approx(0.4)
+    assert said_again_s(said, CAPTURED, 2_100_000) is None
 
 
 def test_the_longest_gap_reaches_to_the_ends() -> None:
