@@ -227,8 +227,9 @@ def test_who_drives_blind_says_so_with_every_command_and_never_by_a_choice_that_
     until(lambda: len(camera.commands) > sent, "commands without a live picture")
     assert all(command["blind"] for command in camera.commands)
     assert page.inner_text(".sight-words").endswith(": you drive blind")
+    # A press on the box is no hold, and the car is given up without a picture.
     box.uncheck()
-    phase(page, "over")
+    until(lambda: camera.commands[-1].get("ends"), "the lease to be given up")
     page.keyboard.up("Space")
     box.check()
     page.get_by_role("button", name="Leave the wheel").click()
@@ -322,7 +323,6 @@ def test_replayed_and_garbled_messages_change_nothing(open_page, server, car, br
     number = int(page.get_attribute(".sight", "data-frame") or 0)
     until(lambda: int(page.get_attribute(".sight", "data-frame") or 0) > number + 20, "newer pictures")
     assert page.get_attribute(".sight", "data-way") == "webrtc"
-    assert broker.sent("/video")[-1]["kind"] in {"ask", "keep"}
     assert len([look for look in broker.sent("/video") if look["kind"] == "offer"]) == 1
     assert camera.viewers == (1, 0)
 
