@@ -26,12 +26,14 @@ KEPT_S = 10.0
 class Frame(NamedTuple):
     """A captured picture. ``number`` counts from 1 in a run of the agent; ``captured_us`` is its capture time
     by the robot's clock, ``monotonic`` the same by the monotonic one, in seconds. ``picture`` is yuv420p of
-    the configured size, and its ``pts`` counts at `RTP_HZ`."""
+    the configured size, and its ``pts`` counts at `RTP_HZ`. ``jpeg`` is what the camera gave, if it gives
+    JPEGs, in its own size."""
 
     number: int
     captured_us: int
     monotonic: float
     picture: av.VideoFrame
+    jpeg: bytes | None = None
 
 
 class Encoded(NamedTuple):

@@ -58,7 +58,8 @@ def keeper(take: Take, ros: int) -> Callable[[Frame], None]:
     kind = compressed_image(ros)
 
     def keep(frame: Frame) -> None:
-        raw = message(frame, jpeg(frame.picture, quality=_QUALITY), ros)
+        # A camera's own JPEG is kept as it is.
+        raw = message(frame, frame.jpeg or jpeg(frame.picture, quality=_QUALITY), ros)
         take(STREAM, frame.captured_us, RosMessage(raw, kind))
 
     return keep

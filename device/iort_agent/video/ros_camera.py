@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
 MOST_PIXELS = 20_000_000
 # A progressive JPEG needs about ten passes over its pixels. One of thousands takes hours in a few kilobytes.
-_SCAN, _MOST_SCANS = b"\xff\xda", 64
+_JPEG, _SCAN, _MOST_SCANS = b"\xff\xd8", b"\xff\xda", 64
 # A topic's publishers have one type, and rarely another after a restart.
 _MAX_KINDS = 8
 
@@ -85,16 +85,18 @@ class Images:
         self._compressed = name == COMPRESSED
         self._decoder = Decoder(parse(kind, definition), large=True)
 
-    def picture(self, data: bytes) -> tuple[int | None, av.VideoFrame]:
-        """The stamp in microseconds, and the picture in a format of its own. Raises `VideoError` and
-        `ContractError` for a message that is damaged, or has another encoding."""
+    def picture(self, data: bytes) -> tuple[int | None, av.VideoFrame, bytes | None]:
+        """The stamp in microseconds, the picture in a format of its own, and the JPEG that it was, if it was
+        one. Raises `VideoError` and `ContractError` for a message that is damaged, or has another
+        encoding."""
         sample: Mapping[str, Any] = self._decoder.decode(data)
         content = sample.get("data")
         if not isinstance(content, Large) or not content:
             raise VideoError("the image has no data")
         stamp = stamp_ns(data, ros2=self._decoder.ros2)
         picture = _decompressed(content) if self._compressed else _of_pixels(sample, content)
-        return None if stamp is None else stamp // 1000, picture
+        jpeg = bytes(content) if self._compressed and content.startswith(_JPEG) else None
+        return None if stamp is None else stamp // 1000, picture, jpeg
 
 
 @functools.lru_cache(maxsize=_MAX_KINDS)
@@ -184,7 +186,7 @@ class RosCamera(Camera):
             header, data, arrival = taken
             try:
                 images = images_of(header.get("type", ""), header.get("message_definition", ""))
-                stamp_us, picture = images.picture(data)
+                stamp_us, picture, jpeg = images.picture(data)
             except (VideoError, ContractError) as error:
                 self._why = str(error)
                 self._throttled.warn("bad", f"the topic {self._topic} gave no good picture: {error}")
@@ -192,7 +194,7 @@ class RosCamera(Camera):
             self._within_s, self._why = SILENT_S, ""
             at = captured(stamp_us, arrival)
             whole = fitted(picture, self._config.width, self._config.height)
-            return Frame(number, at.us, at.monotonic, whole)
+            return Frame(number, at.us, at.monotonic, whole, jpeg)
 
     def report(self) -> Mapping[str, Any]:
         return self._throttled.counts()

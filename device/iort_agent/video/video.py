@@ -285,7 +285,7 @@ class Video:
             # A key picture that was left out is still wanted.
             self._wants_key = self._wants_key or key
             return {}
-        if encoded.key:
+        if key or encoded.key:
             self._keyed_at = frame.monotonic
         encode_ms = (self._clock.monotonic() - frame.monotonic) * 1000
         self._encode_ms.append(encode_ms)

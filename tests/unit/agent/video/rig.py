@@ -6,7 +6,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import threading
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -19,6 +19,7 @@ from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.video import Frame, Pictures
 from iort_agent.video.config import SimCamera, VideoConfig
+from iort_agent.video.encoder import Encoder, make_encoder
 from iort_agent.video.video import Video
 from iort_contract.counter import COLUMNS, HEIGHTS, ROWS, counter_bits, read_counter
 from iort_contract.limits import Value
@@ -141,8 +142,8 @@ class Looks:
 class Rig(Looks):
     """A robot with video; ``settings`` are those of car.yaml's section."""
 
-    def __init__(self, *, clock: Clock | None = None, **settings: Any) -> None:
-        self.clock = clock or SystemClock()
+    def __init__(self, *, encoder: Callable[[VideoConfig], Encoder] = make_encoder, **settings: Any) -> None:
+        self.clock = SystemClock()
         super().__init__(Loopback(self.clock, Dispatcher()))
         self.link = link_of(self.uplink, self.clock)
         self.camera, self.pictures = Counter(self.clock), Pictures()
@@ -153,6 +154,7 @@ class Rig(Looks):
             self.link,
             self.pictures,
             camera=lambda: lambda: self.camera,
+            encoder=encoder,
             record=lambda _, t_us, values: self.samples.append((t_us, dict(values))),
             keep=lambda frame: self.kept.append(frame.number),
         )
