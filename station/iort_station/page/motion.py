@@ -22,7 +22,7 @@ from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry, stopping, viewing
-from iort_station.fleet.roles import Role, has_drivers, transport
+from iort_station.fleet.roles import Role, transport
 from iort_station.operations.alarms import user
 from iort_station.page.page import load_keys
 from iort_station.page.requests import number, text, whole
@@ -39,9 +39,8 @@ def reaching(cloud: Cloud, live: str) -> dict[str, Any]:
             "-c live_transport=pubnub"
         )
     pubnub = load_keys(cloud).reading() if live == PUBNUB else {}
-    # A driver's commands go to the broker, whichever way the page listens.
-    broker = {"broker": _origin(cloud)} if live == IOT or has_drivers(cloud) else {}
-    return {"live": live, **broker, **pubnub}
+    # Commands and looks at a camera go to the broker, whichever way the page listens.
+    return {"live": live, "broker": _origin(cloud), **pubnub}
 
 
 def everybody(cloud: Cloud) -> dict[str, Any]:
