@@ -285,7 +285,7 @@ describe("a hold", () => {
   for (const [change, reason] of [
     [{ see: null }, "The picture is 520 ms old, at most 500 ms is allowed"],
     [{ hidden: true }, "This tab is hidden: nobody sees the picture"],
-    [{ see: null, shown: false }, "There is no picture"],
+    [{ see: null, shown: false }, "No picture is on the screen"],
   ] as const)
     for (const let_go of [[], [10, { hold: false }]] as const)
       test(`by sight gives the car up at once: ${reason}, ${let_go.length === 0 ? "driving" : "held"}`, () => {

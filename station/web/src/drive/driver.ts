@@ -222,7 +222,7 @@ export class Driver {
     if (this.maxPicture_ms === undefined || this.blind) return "";
     if (this.hidden) return "This tab is hidden: nobody sees the picture";
     const age = this.picture_ms(now_ms);
-    if (age === undefined) return "There is no picture";
+    if (age === undefined) return "No picture is on the screen";
     return age > this.maxPicture_ms
       ? `The picture is ${Math.round(age)} ms old, at most ${this.maxPicture_ms} ms is allowed`
       : "";

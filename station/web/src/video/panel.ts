@@ -118,6 +118,7 @@ export class PicturePanel {
   open(): void {
     if (this.on || this.robot === undefined || !this.terms) return;
     this.on = true;
+    this.frame.style.setProperty("--shape", `${this.terms.width} / ${this.terms.height}`);
     this.arranged();
     this.attend();
     this.draw();
