@@ -40,9 +40,9 @@ class Command:
     refused, unless it is later and says ``takeover``. A session that was refused so stays refused. A motion
     that ``ends`` its lease stops the robot at once, and lets others drive. ``frame`` is the number of the
     newest picture on the driver's screen. A robot with video refuses a motion that names none, or an old
-    one, unless its driver says that he drives ``blind``; one that ``ends`` needs neither. ``message`` is the
-    ROS message. With ``answer`` the robot reports the result in its shadow: `COMMANDS`, name, ``session``,
-    ``seq`` and ``outcome``, which is `ACCEPTED` or the reason."""
+    one, unless its driver says that he drives ``blind``; one that ``ends`` needs neither, and is its stop.
+    ``message`` is the ROS message. With ``answer`` the robot reports the result in its shadow: `COMMANDS`,
+    name, ``session``, ``seq`` and ``outcome``, which is `ACCEPTED` or the reason."""
 
     session: str
     started_us: int

@@ -78,7 +78,7 @@ class Motion:
 
     def __init__(self, topic: str, stop: Mapping[str, Any], definition: Definition) -> None:
         self.topic, self.leases = topic, Leases()
-        self._stop, self._definition = stop, definition
+        self.stop_message, self._definition = stop, definition
         self.stopping = False
         # What the guard knows: the lease's end, and whether an emergency stop holds.
         self.guarded: tuple[float | None, bool] = (None, False)
@@ -97,7 +97,7 @@ class Motion:
         return self.written if now < self.written and (due is None or self.written < due) else due
 
     def stop(self, now_us: int) -> bytes:
-        return encode(self._definition, self._stop, now_us=now_us, partial=True)
+        return encode(self._definition, self.stop_message, now_us=now_us, partial=True)
 
 
 class Named:
@@ -426,6 +426,10 @@ class Commands:
         except MessageError as error:
             return ("malformed", str(error)), None
         motion, asked = command.motion, self._clock.monotonic()
+        if motion is not None and self._sight is not None and offered.ends:
+            # It passes by any picture, so it must move nothing, whatever it says.
+            offered = replace(offered, message=motion.stop_message)
+            data = motion.stop(self._clock.now_us())
         # Before the lock, so that no stop waits for the pictures.
         picture_ms = self._picture_ms(offered, asked)
         # All times under the lock, for which the command may have waited.

@@ -23,9 +23,9 @@ What a session has sent before its lease ended moves nothing after the stop, eve
 lease still holds.
 
 A robot with video is driven by sight: a motion passes only if the picture that its driver saw is young enough
-when it comes, or if he says that he drives blind. One that ends the lease always does. This is asked last, so
-that an emergency stop, another driver or an old command is told as what it is, and a late picture takes
-nothing over.
+when it comes, or if he says that he drives blind. One that ends the lease always passes, and the robot gets
+its stop in place of the message. This is asked last, so that an emergency stop, another driver or an old
+command is told as what it is, and a late picture takes nothing over.
 
 Only a command later than all that passed may pass. Commands carry the cloud's time. The robot knows it to
 within the uncertainty of its measured offset (`iort_agent.lanes.pings`), and counts a command as old

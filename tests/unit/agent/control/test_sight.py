@@ -109,6 +109,20 @@ def test_the_end_of_a_lease_passes_by_any_picture_and_stops_the_robot(frame: int
     assert rig.graph.published[-1][1] == doubles(1.0)
 
 
+def test_the_end_of_a_lease_moves_nothing_whatever_it_says() -> None:
+    rig = Seeing()
+    for _ in range(5):
+        rig.send({"data": 2.5}, ends=True)
+        rig.downlink.tick()
+        rig.clock.advance(0.02)
+    assert {data for _, data in rig.graph.published} == {doubles(0.0)}
+    assert ("accepted", None, None, False) in [sample[:4] for sample in told(rig)]
+    assert [sample["speed"] for sample in rig.drove if sample["speed"]] == []
+    # One that is malformed ends nothing.
+    rig.send({"data": "fast"}, ends=True, answer=True)
+    assert rig.answers[0][2] is not None
+
+
 def test_a_frozen_picture_lets_the_lease_end_and_the_stop_tells_the_last_picture() -> None:
     rig = Seeing()
     for _ in range(40):
