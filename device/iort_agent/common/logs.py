@@ -151,6 +151,10 @@ class JournalFormatter(LineFormatter):
         return "\n".join(prefix + line for line in super().format(record).split("\n"))
 
 
+# A viewer of video costs it twelve lines: each pair of addresses, and what becomes of it.
+_TALKATIVE = ("aioice",)
+
+
 def set_up(level: str) -> Troubles:
     """Log to standard error from now on. Returns the handler that keeps the latest warnings and errors."""
     lines, troubles = logging.StreamHandler(sys.stderr), Troubles()
@@ -165,8 +169,11 @@ def set_up(level: str) -> Troubles:
 
 
 def set_level(level: str) -> None:
-    """Log records of this level and above."""
+    """Log records of this level and above; of a library that tells every step, warnings alone unless the
+    level is debug."""
     logging.getLogger().setLevel(level.upper())
+    for name in _TALKATIVE:
+        logging.getLogger(name).setLevel(logging.WARNING if level == "info" else logging.NOTSET)
 
 
 def is_journal() -> bool:

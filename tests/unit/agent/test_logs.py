@@ -13,7 +13,7 @@ from typing import Any, Iterator
 import pytest
 
 from iort_agent.agent import Agent
-from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is_journal
+from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is_journal, set_level
 from iort_agent.config import Config
 from iort_agent.errors import SourceError
 from iort_agent.mqtt.dispatch import Dispatcher
@@ -84,6 +84,19 @@ def test_the_journal_is_recognized_by_its_stream(monkeypatch: pytest.MonkeyPatch
         assert is_journal()
         monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino + 1}")
         assert not is_journal()
+
+
+@pytest.mark.parametrize(("level", "told"), [("info", False), ("debug", True)])
+def test_a_viewers_addresses_are_told_to_who_debugs_alone(level: str, told: bool) -> None:
+    root = logging.getLogger()
+    before = root.level
+    try:
+        set_level(level)
+        assert logging.getLogger("aioice.ice").isEnabledFor(logging.INFO) == told
+        assert logging.getLogger("aioice.ice").isEnabledFor(logging.WARNING)
+    finally:
+        root.setLevel(before)
+        logging.getLogger("aioice").setLevel(logging.NOTSET)
 
 
 def test_the_last_troubles_are_kept_and_warnings_do_not_displace_errors() -> None:
