@@ -74,7 +74,7 @@ READER = """
   };
   setInterval(() => {
     for (const video of document.querySelectorAll("video")) if (!followed.has(video)) follow(video);
-    const panel = document.querySelector("[data-on]");
+    const panel = document.querySelector(".sight");
     const age = panel?.querySelector(".sight-age")?.textContent.replace(/[^0-9]/g, "");
     if (age) window.panelSays.push([Date.now() * 1000, panel.dataset.state, +panel.dataset.frame, +age]);
   }, 50);
@@ -82,7 +82,7 @@ READER = """
   let newest = null;
   const compare = () => {
     requestAnimationFrame(compare);
-    const drawn = document.querySelector("[data-on][data-way=broker] canvas");
+    const drawn = document.querySelector(".sight[data-way=broker] canvas");
     const read = drawn && number(drawn, drawn.width, drawn.height);
     if (read && read !== newest) window.shownPictures.push([Date.now() * 1000, newest = read, null]);
   };

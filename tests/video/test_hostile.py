@@ -38,7 +38,7 @@ from testkit.video_viewer import Viewer
 from testkit.waiting import InstrumentError, until
 from tests.local.conftest import bundle, embedded  # noqa: F401 - fixtures
 
-TWENTY = 20
+TWENTY, ONCE = 20, "0c0ffee0"
 SETTINGS = {
     "sources": [{"type": "sim", "rate_hz": 20}],
     "video": {"source": {"type": "sim"}, "width": 320, "height": 240, "rate_hz": 5},
@@ -85,7 +85,7 @@ def test_another_robot_can_neither_ask_nor_answer(
 ) -> None:
     namespace = embedded.cloud.namespace
     stranger = bundle("stranger")
-    look = encode_look(Asked("0badcafe", "1", OFFER, sdp=an_offer()))
+    look = encode_look(Asked("0badcafe", "00000001", OFFER, sdp=an_offer()))
     for topic in (look_topic(car.robot, namespace), answer_topic(car.robot, viewer.viewer, namespace)):
         with Robot(stranger.folder) as other:
             assert other.online().attempt(topic, look) != "SUCCESS"
@@ -97,12 +97,12 @@ def test_another_robot_can_neither_ask_nor_answer(
 
 def test_an_offer_that_is_said_again_is_answered_once(viewer: Viewer, car: Bundle) -> None:
     sdp = an_offer()
-    first = viewer.send(OFFER, sdp, request="once")
+    first = viewer.send(OFFER, sdp, request=ONCE)
     assert viewer.answer(first).kind == ANSWER
-    viewer.send(OFFER, sdp, request="once")
+    viewer.send(OFFER, sdp, request=ONCE)
     # Requests are answered in their order.
     assert viewer.ask(ASK).kind == TERMS
-    assert [show.kind for show in viewer.heard if show.request == "once"] == [ANSWER]
+    assert [show.kind for show in viewer.heard if show.request == ONCE] == [ANSWER]
     assert told(car)["viewers"] == 1
 
 
