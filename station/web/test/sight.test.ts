@@ -392,6 +392,9 @@ describe("a viewer", () => {
     await rig.pass(3_500);
     assert.equal(rig.count("pictures"), 2);
     assert.ok(rig.sight.sighted()!.age_ms! > 3_500);
+    // The car's clock was set back, or somebody replays: what comes is shown with its age.
+    await rig.picture(2, 7_000, 20);
+    assert.deepEqual([rig.sight.sighted()?.number, rig.sight.sighted()?.age_ms], [2, 7_000]);
   });
 
   test("has small pictures while WebRTC stands still, and WebRTC's once it goes on", async () => {

@@ -399,7 +399,9 @@ export class Sight {
     small.pictures += 1;
     small.clock.heard(picture.sent_ms - at, at - picture.sent_ms, at);
     // One that is older than what is shown, or that comes while another is decoded, is left out.
-    if (this.decoding || (small.seen && picture.captured_ms <= small.seen.captured_ms)) return;
+    // After a while an older one is shown, too, with its age: the car's clock may have been set back.
+    const newest = at - (small.seen?.at_ms ?? -Infinity) < ASK_AGAIN_MS ? small.seen : undefined;
+    if (this.decoding || (newest && picture.captured_ms <= newest.captured_ms)) return;
     this.decoding = true;
     const drawn = await this.eyes.draw(picture.jpeg).finally(() => (this.decoding = false));
     if (!drawn || small !== this.small) return;
