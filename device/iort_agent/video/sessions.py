@@ -38,6 +38,8 @@ _log = logging.getLogger(__name__)
 CLOSE_S = 5.0
 # A viewer reports once or twice a second. One that is not heard for longer is out of reach: it gets nothing.
 QUIET_S = 6.0
+# One that was not heard for longer than this has missed much: it waits for a key picture.
+_BACK_S = 1.5
 # What a viewer may send on the data channel in a second, and what is not counted as garbage.
 MESSAGES_PER_S, MAX_GARBAGE = 20, 200
 # What may wait on the data channel: some eight marks' messages.
@@ -237,7 +239,7 @@ class Session:
 
     def _hear(self, now: float) -> None:
         silent_s, self._heard = now - self._heard, now
-        if silent_s > QUIET_S:
+        if silent_s > _BACK_S:
             self._on_key()
 
     def _on_report(self) -> None:

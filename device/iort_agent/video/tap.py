@@ -19,12 +19,15 @@ import logging
 from typing import Any, Awaitable, Callable
 
 from aiortc import RTCPeerConnection, RTCRtpSender
-from aiortc.rtp import RtcpPsfbPacket, RtcpRrPacket, RtcpSrPacket, unpack_remb_fci
+from aiortc.rtp import RtcpPsfbPacket, RtcpRrPacket, RtcpRtpfbPacket, RtcpSrPacket, unpack_remb_fci
 
 _log = logging.getLogger(__name__)
 
-# Feedback of RFC 4585 and RFC 5104: picture loss, full intra request, and the application's (REMB).
-_PLI, _FIR, _APPLICATION = 1, 4, 15
+# Feedback of RFC 4585 and RFC 5104: lost packets; picture loss, full intra request, and the application's
+# (REMB).
+_NACK, _PLI, _FIR, _APPLICATION = 1, 1, 4, 15
+# The sender can repeat its last 128 packets. Who misses so many waits for some that never come.
+_GAP = 64
 _HANDLE, _STAMP = "_handle_rtcp_packet", "_RTCRtpSender__rtp_timestamp"
 _TIMEOUT, _MOST_S = "_rto", 1.0
 _UINT32 = 0xFFFFFFFF
@@ -43,7 +46,7 @@ def _missing(name: str) -> None:
 
 class Tap:
     """Listens at a sender, in its loop. ``on_report`` is called after each report of the viewer, ``on_key``
-    when the viewer needs a key picture.
+    when the viewer needs a key picture: it says so, or misses more than can be repeated.
 
     ``bitrate_bps`` is what the viewer says that it can take; None before it has said so. ``lost`` is the
     share of packets that its newest report misses; None if that has none.
@@ -86,7 +89,13 @@ class Tap:
             except Exception:  # noqa: BLE001 - a viewer may send anything
                 _log.debug("video: a viewer's report cannot be read")
         self._on_report()
-        if isinstance(packet, RtcpPsfbPacket) and packet.fmt in (_PLI, _FIR):
+        if isinstance(packet, RtcpPsfbPacket):
+            needs_key = packet.fmt in (_PLI, _FIR)
+        else:
+            needs_key = (
+                isinstance(packet, RtcpRtpfbPacket) and packet.fmt == _NACK and len(packet.lost) >= _GAP
+            )
+        if needs_key:
             self._on_key()
 
 

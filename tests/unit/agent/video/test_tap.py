@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from aiortc import RTCPeerConnection, RTCRtpSender
 from aiortc.rtcsctptransport import RTCSctpTransport
-from aiortc.rtp import RtcpPsfbPacket, RtcpReceiverInfo, RtcpRrPacket, pack_remb_fci
+from aiortc.rtp import RtcpPsfbPacket, RtcpReceiverInfo, RtcpRrPacket, RtcpRtpfbPacket, pack_remb_fci
 
 from iort_agent.video import tap
 from iort_agent.video.tap import Tap, gather, hurry
@@ -62,6 +62,11 @@ def test_it_hears_what_this_versions_sender_is_told() -> None:
         for fmt in (1, 4):
             await one._handle_rtcp_packet(RtcpPsfbPacket(fmt=fmt, ssrc=1, media_ssrc=one._ssrc, fci=b""))
         assert heard.keys == 2
+        # A few lost packets are repeated; a gap of hundreds cannot be.
+        for lost, keys in ((2, 2), (100, 3)):
+            missing = RtcpRtpfbPacket(fmt=1, ssrc=1, media_ssrc=one._ssrc, lost=list(range(lost)))
+            await one._handle_rtcp_packet(missing)
+            assert heard.keys == keys
         await peer.close()
 
     asyncio.run(run())
