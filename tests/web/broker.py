@@ -15,7 +15,7 @@ CONNECT, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, PING = 1, 3, 8, 10, 12
 CONNACK, SUBACK, UNSUBACK, PONG = bytes([0x20, 3, 0, 0, 0]), 0x90, 0xB0, bytes([0xD0, 0])
 
 
-def _length(sent: bytes, at: int) -> tuple[int, int] | None:
+def _length(sent: bytes | bytearray, at: int) -> tuple[int, int] | None:
     """A number in groups of seven bits, of which the last has no high bit, and where it ends; None if it is
     cut off."""
     for end in range(at + 1, at + 5):
