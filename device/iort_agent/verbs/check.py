@@ -46,7 +46,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
         yield from source.check(f"source {i} ({source.describe()})")
     yield from _queue(config)
     yield from _recorder(config)
-    yield from config.video.check() if config.video is not None else ()
+    yield from _video(config, running)
     yield _lanes(config)
     yield emergency_stop(config)
     yield from rows(config, running)
@@ -153,6 +153,29 @@ def _recorder(config: Config) -> Iterator[Finding]:
         )
     else:
         yield Finding("recorder", OK, text)
+
+
+def _video(config: Config, running: Status | None) -> Iterator[Finding]:
+    if config.video is None:
+        return
+    yield from config.video.check()
+    if running is None or running.video is None:
+        return
+    wrong = [
+        alarm
+        for alarm in running.alarms
+        if alarm.startswith(("video", "the thread camera", "the thread video"))
+    ]
+    if wrong:
+        yield Finding("camera", FAIL, "; ".join(wrong), "nobody can drive by sight: see `iort-agent status`")
+    elif running.video.get("open"):
+        viewers, watchers, kbps = (
+            running.video.get(name, 0) for name in ("viewers", "watchers", "bitrate_kbps")
+        )
+        text = f"{viewers} viewer(s) at {kbps} kbit/s, {watchers} of pictures over the broker"
+        yield Finding("camera", OK, text)
+    else:
+        yield Finding("camera", OK, "nobody looks, so it is closed")
 
 
 def emergency_stop(config: Config) -> Finding:

@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import pytest
 from PIL import Image
@@ -16,8 +17,10 @@ from iort_agent.common.threads import WATCH
 from iort_agent.errors import VideoError
 from iort_agent.metrics import MetricsConfig
 from iort_agent.ros.json_message import decode
+from iort_agent.sources import FAIL, OK
 from iort_agent.sources.sim import SimConfig
 from iort_agent.status import render
+from iort_agent.verbs.check import _video
 from iort_agent.video import Frame
 from iort_agent.video.encoder import make_encoder
 from iort_agent.video.kept import keeper
@@ -326,3 +329,19 @@ def test_a_kept_picture_is_a_compressed_image_of_either_ros(ros, own):
         assert read_counter(lambda x, y: image.getpixel((x, y)), *image.size) == 7
     # ROS knows a type by this.
     assert message.kind.md5sum == ("8f7a12909da2c9d3332d540a0977563f" if ros == 1 else "")
+
+
+def test_the_check_tells_what_the_running_agents_camera_does():
+    rig = AgentRig(sources=(SimConfig(),), video=CONFIG)
+    running = make_status(rig.agent)
+
+    def camera(**changes):
+        finding = list(_video(rig.agent.config, replace(running, **changes)))[-1]
+        return finding.level, finding.text
+
+    assert camera() == (OK, "nobody looks, so it is closed")
+    looked = {"open": True, "viewers": 2, "watchers": 1, "bitrate_kbps": 640}
+    assert camera(video=looked) == (OK, "2 viewer(s) at 640 kbit/s, 1 of pictures over the broker")
+    alarm = "the thread camera failed and starts again: 1 time(s): VideoError: /dev/video0: unplugged"
+    assert camera(alarms=[alarm, "source failed: vesc"]) == (FAIL, alarm)
+    assert list(_video(replace(rig.agent.config, video=None), running)) == []
