@@ -1,4 +1,4 @@
-"""Takes the pictures in docs/images: `make screenshots`.
+"""Takes the pictures in docs/images: `make screenshots`, or with `ONLY=video` those of driving by sight.
 
 On the embedded cloud: one real agent drives a simulated car through everything, and other cars are
 published to PubNub's stand-in as Lambda 1 would, so that there is a fleet to see, with a fault, a car that
@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,13 +28,16 @@ from iort_analysis.samples.blocks import Block
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.cloud import IOT
 from iort_contract.messages.analysis import AnalysedDrive, DriveKey
+from iort_contract.messages.commands import DRIVE_TYPE
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import findings
 from iort_station.data.runs import laps_of_runs, runs
 from iort_station.fleet import robots
 from iort_station.kept import CLOUD
+from iort_station.page import motion
 from iort_station.page.answers import actions, answers, downloads, keyed_actions
 from iort_station.page.server import PageServer
 from iort_station.times import iso
@@ -61,6 +64,24 @@ VIEWS = {
     "alarms": "#/alarms",
     "cloudwatch": "#/cloudwatch",
 }
+VIDEO, _SEEN, _HOLDS, _AHEAD_MS = "video", "car7", 20, 2_000
+# A car that is driven by its camera's picture.
+_SIGHT = {
+    "sources": [{"type": "sim", "rate_hz": 50, "pace": 0.1}],
+    "ping": {"rate_hz": 5},
+    "video": {"source": {"type": "sim"}},
+    "downlink": {
+        "cmd": {
+            "drive": {
+                "topic": "/drive",
+                "type": DRIVE_TYPE,
+                "partial": True,
+                "motion": {"lease_s": 0.5, "stop": {"drive": {"speed": 0.0}}},
+            }
+        },
+        "drive": {"command": "drive", "speed": "drive.speed", "steering": "drive.steering_angle"},
+    },
+}
 _PLOTTED = "speed_mps,current_motor,voltage_input"
 _FILL_S = 65.0
 _SETTLE_MS = 4_000
@@ -69,13 +90,17 @@ _LAPS_MS = 90_000
 
 
 def main() -> None:
-    """Drive, look, and write one picture a view, theme and width; and what `iort plot` draws."""
+    """Drive, look, and write one picture a view, theme and width; and what `iort plot` draws. An argument
+    ``video`` takes only those of driving by sight."""
     with ExitStack() as stack:
         # Open the browser first: without it nothing else is needed.
         browser = stack.enter_context(chromium.opened())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         embedded = stack.enter_context(EmbeddedCloud(folder / "local"))
         cloud = embedded.cloud
+        _by_sight(browser, cloud, folder)
+        if sys.argv[1:] == [VIDEO]:
+            return
         stack.enter_context(_driving(embedded, folder))
         server = PageServer(
             namespace=cloud.namespace,
@@ -138,6 +163,41 @@ def _scrub(page: Any) -> None:
     slider = page.locator(".scrub")
     half = int(slider.get_attribute("max") or 0) * 6 // 10
     slider.evaluate(f"(node) => {{ node.value = {half}; node.dispatchEvent(new Event('input')) }}")
+
+
+def _by_sight(browser: Any, cloud: Cloud, folder: Path) -> None:
+    """Drive a car by its camera's picture, in each theme and width."""
+    from playwright.sync_api import TimeoutError as LateError  # noqa: PLC0415 - only this command needs it
+
+    bundle = robots.add(cloud, _SEEN, out=folder, settings=_SIGHT)
+    server = PageServer(
+        namespace=cloud.namespace,
+        **motion.reaching(cloud, IOT),
+        vehicles={_SEEN: robots.F1TENTH},
+        answers=answers(cloud, HALL),
+        track=HALL,
+        open_actions=actions(cloud),
+        actions=keyed_actions(cloud),
+    )
+    looks = ("dark", LAPTOP, 1, "dark"), ("light", LAPTOP, 1, "light"), ("phone", PHONE, 2, "dark")
+    for name, size, ratio, theme in looks:
+        # Each time from the start, where it sees along the track.
+        with server, AgentProcess(bundle, drain_s=0.0):
+            page = _page(browser, server.invitation(f"#/car/{_SEEN}"), size, ratio=ratio)
+            page.emulate_media(color_scheme=theme)
+            page.get_by_role("button", name="Take the wheel").click()
+            page.wait_for_selector(".sight[data-state=live]")
+            for _ in range(_HOLDS):
+                page.keyboard.down("Space")
+                with suppress(LateError):
+                    page.wait_for_selector(".drive[data-phase=driving]", timeout=_SETTLE_MS)
+                    break
+                page.keyboard.up("Space")
+            page.keyboard.down("ArrowUp")
+            page.wait_for_timeout(_AHEAD_MS)
+            page.locator(".sight").scroll_into_view_if_needed()
+            _write(OUT / f"{VIDEO}-{name}.webp", page.screenshot())
+            page.close()
 
 
 @contextmanager

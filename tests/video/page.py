@@ -179,6 +179,11 @@ class Viewer:
             self.tabs.uncover(tab)
             self.connect()
 
+    @property
+    def way(self) -> str | None:
+        """How the newest picture came: ``webrtc`` or ``broker``."""
+        return self._page.locator(".sight").get_attribute("data-way")
+
     def live(self) -> None:
         """Wait until pictures come, and one of the last second is on the screen."""
         now_us = time.time_ns() // 1000

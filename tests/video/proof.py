@@ -48,6 +48,7 @@ CUT_S, RECOVERY_S = 5.0, 2.0
 # The networks, by what is told of them; and a line that becomes half as wide while somebody looks.
 NETWORKS: dict[str, dict[str, Any]] = {"0 ms": {}, "50 ms": {"delay_ms": 25.0}, "5 % loss": {"loss": 0.05}}
 LINE, HALF, LINE_KBIT_S = "1 Mbit/s", "halved to 500 kbit/s", 1000.0
+NO_UDP = "no UDP, by the broker"
 # So many pictures after a cut tell that they are back.
 _BACK = 10
 ENCODER, NETWORK, TAB, THREAD = "encoder stopped", "network cut", "tab hidden", "video thread killed"
@@ -135,6 +136,7 @@ class Proof:
             viewer.sit()
             for failure in (ENCODER, NETWORK, TAB, THREAD):
                 self._try(viewer, failure)
+            self._without_udp(viewer)
             self._shown[CHROMIUM], self._said = viewer.shown, viewer.said
         self._account(began_us)
 
@@ -236,6 +238,20 @@ class Proof:
             done += 1
             self._say(f"{failure}: {done} of {self._tries}")
 
+    def _without_udp(self, viewer: Viewer) -> None:
+        """Let only the broker be in reach, and drive by its pictures."""
+        wire = self.scene.wire
+        if wire is None:
+            return
+        viewer.live()
+        wire.set(cut=True)
+        until(lambda: viewer.way == "broker", "pictures over the broker")
+        self._pause.wait(_WARM_UP_S)
+        viewer.drive()
+        self._measured(NO_UDP, CHROMIUM)
+        viewer.release()
+        wire.set(cut=False)
+
     # --- lanes -------------------------------------------------------------------------------------
 
     def _lanes(self) -> None:
@@ -301,6 +317,9 @@ class Proof:
                     "held_ms": asdict(Spread.of(held)),
                     "live_share": round(
                         live_share(self._shown[one.viewer], self._captured, one.span, LIMIT_MS), 3
+                    ),
+                    "passed": sum(
+                        each.passed for each in commands if one.span[0] <= each.at_us < one.span[1]
                     ),
                     "longest_gap_ms": round(longest_gap_ms(self._shown[one.viewer], one.span)),
                 }

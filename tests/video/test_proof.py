@@ -17,7 +17,7 @@ import pytest
 from local.cloud import EmbeddedCloud
 from testkit.machine import describe
 from tests.local.conftest import embedded  # noqa: F401 - a fixture
-from tests.video.proof import AIORTC, CHROMIUM, NETWORK, Proof
+from tests.video.proof import AIORTC, CHROMIUM, NETWORK, NO_UDP, Proof
 from tests.video.report import kept, report
 from tests.video.scene import LIMIT_MS, Scene
 
@@ -85,6 +85,14 @@ def test_a_bad_network_gives_fewer_pictures_and_not_later_ones(proof: Proof) -> 
         assert one["pictures_hz"] > 0, one
         if one["viewer"] == CHROMIUM:
             assert one["age_ms"]["p50"] <= LIMIT_MS, one
+
+
+def test_without_udp_the_car_is_seen_and_driven_over_the_broker(proof: Proof) -> None:
+    if proof.scene.wire is None:
+        pytest.skip("no network between machines here")
+    (one,) = [each for each in proof.figures.bad if each["network"] == NO_UDP]
+    assert one["pictures_hz"] > 0
+    assert one["passed"] > 0
 
 
 def test_both_viewers_read_the_number_in_the_picture(proof: Proof) -> None:

@@ -116,7 +116,7 @@ class GstreamerEncoder:
     def _start(self, now: float) -> None:
         self.close()
         self._kbps, self._opened, self._keyed, self._within_s = self._aim, now, now, _BEGIN_S
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - the method close closes it
         try:
             self._process = subprocess.Popen(  # noqa: S603 - the owner of car.yaml chose the pipeline; no shell
                 self._command(),
