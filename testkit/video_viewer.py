@@ -124,19 +124,20 @@ class Viewer:
         self._on_show(show)
 
 
-class _Prompt(JitterBuffer):
+class Prompt(JitterBuffer):
     """Gives a picture once its last packet has come, as browsers do, and begins again with a key picture
     after one that stays incomplete. aiortc's own waits for the first packet of the next picture, and for a
     lost packet until 512 have come after it."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__(capacity=512, is_video=True)
+        self._now = now
         self._hole_since: float | None = None
 
     def add(self, packet: Any) -> tuple[bool, JitterFrame | None]:
         plead, frame = super().add(packet)
-        if self._hole_since is not None and time.monotonic() - self._hole_since > _HOLE_S:
-            self._hole_since = time.monotonic()
+        if self._hole_since is not None and self._now() - self._hole_since > _HOLE_S:
+            self._hole_since = self._now()
             return True, frame
         return plead, frame
 
@@ -147,8 +148,8 @@ class _Prompt(JitterBuffer):
             self._hole_since = None
             return first
         if any(self._packets):
-            self._hole_since = self._hole_since or time.monotonic()
-            if time.monotonic() - self._hole_since > _HOLE_S:
+            self._hole_since = self._hole_since or self._now()
+            if self._now() - self._hole_since > _HOLE_S:
                 return self._skipped()
         return None
 
@@ -207,7 +208,7 @@ class Watch:
         loop = asyncio.get_running_loop()
         transceiver = self.peer.addTransceiver("video", direction="recvonly")
         receiver = transceiver.receiver
-        setattr(receiver, _BUFFER, _Prompt())
+        setattr(receiver, _BUFFER, Prompt())
         channel = self.peer.createDataChannel(CHANNEL, ordered=False, maxRetransmits=0)
         channel.on("message", self._mark)
         self.peer.on("connectionstatechange", lambda: self._tell({"state": self.peer.connectionState}))
