@@ -102,7 +102,9 @@ class Video:
         self._lock = threading.Lock()
         self._handed: Encoded | None = None
         self._missed = False
-        self._wants_key, self._keyed_at = False, float("-inf")
+        # Whether a viewer has connected, and whether one needs a key picture.
+        self._begun = self._wants_key = False
+        self._keyed_at = float("-inf")
         self._kbps = self._start_kbps()
         self._pacer = Pacer(config.pictures_hz)
         # What is wrong with the camera, and when it is tried again.
@@ -193,10 +195,12 @@ class Video:
 
     def _on_demand(self, demand: Demand) -> None:
         self._demand = demand
+        if not demand.viewers:
+            self._begun = self._wants_key = False
         self._capture.want(wanted=any(demand))
 
     def _want_key(self) -> None:
-        self._wants_key = True
+        self._begun = self._wants_key = True
 
     def _show(self) -> None:
         """Give the newest picture to all sessions."""
@@ -235,7 +239,6 @@ class Video:
 
     def _forget_encoder(self) -> None:
         encoder, self._encoder = self._encoder, None
-        self._wants_key = False
         if encoder is not None:
             encoder.close()
 
@@ -271,8 +274,7 @@ class Video:
         """Encode a picture and hand it over; what is recorded of it, nothing if it was left out."""
         encoder = self._encoder
         if encoder is None:
-            # Nobody has connected yet.
-            if not self._wants_key:
+            if not self._begun:
                 return {}
             encoder = self._encoder = self._make_encoder(self._config)
         kbps = self._kbps

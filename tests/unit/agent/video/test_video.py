@@ -29,6 +29,7 @@ from iort_agent.video.video import KEY_EVERY_S
 from iort_contract.counter import read_counter
 from iort_contract.messages.shadow import decode_reported
 from iort_contract.messages.video import (
+    ANSWER,
     ASK,
     END,
     ENDED,
@@ -225,6 +226,17 @@ def test_a_camera_that_fails_is_told_to_viewers_and_to_those_who_come(rig, loop)
     assert ended.why == "the camera does not work: /dev/video0: unplugged"
     assert rig.ask(rig.name(), ASK).why == "the camera does not work: /dev/video0: unplugged"
     assert any("unplugged" in alarm for alarm in WATCH.alarms())
+
+
+def test_a_camera_thread_that_fails_goes_on_for_the_same_viewers(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+    rig.camera.error = RuntimeError("of a kind that nobody handles")
+    until(lambda: [alarm for alarm in WATCH.alarms() if "the thread camera" in alarm], "the alarm")
+    rig.camera.error = None
+    newest = rig.video.report()["captured"]
+    until(lambda: (viewer.seen[-1].number or 0) > newest, "newer pictures")
+    assert [show.kind for show in rig.shows[viewer.name]] == [ANSWER]
 
 
 def test_a_killed_thread_ends_the_sessions_and_new_ones_begin(rig, loop):
