@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 from aiohttp import web
 
@@ -102,10 +103,12 @@ class PageBroker(BackgroundServer):
         self._pages[page] = set()
         sent = bytearray()
         try:
-            async for message in page:
-                sent += message.data
-                for kind, body in packets(sent):
-                    await self._follow(page, kind, body)
+            # A page may go before it is answered.
+            with suppress(ConnectionResetError):
+                async for message in page:
+                    sent += message.data
+                    for kind, body in packets(sent):
+                        await self._follow(page, kind, body)
         finally:
             del self._pages[page]
         return page

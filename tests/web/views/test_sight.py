@@ -84,15 +84,38 @@ def take_the_wheel(page):
     sight(page, state="live")
 
 
-def drive(page):
-    """Hold the dead-man's switch by a key until the car takes commands."""
-    page.keyboard.down("Space")
-    phase(page, "driving")
+def hold(page, press, release, works, what):
+    """Hold the dead-man's switch until it works. On a busy machine an answer may come too late, which ends a
+    hold: then it is let go, and held again."""
+    press()
+
+    def tried():
+        if page.get_attribute(".drive", "data-phase") == "over":
+            release()
+            press()
+        return works()
+
+    until(tried, what)
+
+
+def drive(page, works=lambda: True):
+    """Hold it by a key until the car takes commands."""
+    hold(
+        page,
+        lambda: page.keyboard.down("Space"),
+        lambda: page.keyboard.up("Space"),
+        lambda: page.get_attribute(".drive", "data-phase") == "driving" and works(),
+        "the car to be driven",
+    )
 
 
 def motions(camera):
     """The commands that may move the car."""
     return [command for command in list(camera.commands) if not command.get("ends")]
+
+
+def moves(camera):
+    return motions(camera)[-1]["message"]["drive"]["speed"] > 0
 
 
 def test_the_picture_is_shown_with_its_age_and_only_while_somebody_looks(
@@ -132,9 +155,8 @@ def test_driving_ends_when_the_picture_freezes_and_begins_with_a_new_hold(open_p
     # The wheel has the picture by itself.
     take_the_wheel(page)
     assert not page.locator("[name=blind]").last.is_checked()
-    drive(page)
     page.keyboard.down("ArrowUp")
-    until(lambda: motions(camera)[-1]["message"]["drive"]["speed"] > 0, "the car to be moved")
+    drive(page, lambda: moves(camera))
     # Every command names a picture that was on the screen.
     frames = [command["frame"] for command in motions(camera)]
     assert frames == sorted(frames)
@@ -147,7 +169,6 @@ def test_driving_ends_when_the_picture_freezes_and_begins_with_a_new_hold(open_p
     until(lambda: words.inner_text().startswith("Frozen for "), "the words")
     assert words.inner_text().endswith(" s: driving has ended")
     assert page.locator(".sight [role=status]").inner_text() == "The picture is frozen"
-    assert "The picture is" in page.inner_text(".drive-said")
     until(lambda: camera.commands[-1].get("ends"), "the lease to be given up")
     sent, told = len(motions(camera)), words.inner_text()
     until(lambda: words.inner_text() != told, "time to pass")
@@ -281,16 +302,15 @@ def test_a_phone_drives_on_the_whole_screen(open_page, server, car, camera, scri
         assert not page.locator(".gauge").first.is_visible()
         assert not page.get_by_role("link", name="Alarms").is_visible()
     fingers = Fingers(page)
-    fingers.put(1, *middle(page, ".deadman"))
-    phase(page, "driving")
     fingers.put(2, *middle(page, ".stick"))
     fingers.put(2, middle(page, ".stick")[0], 0)
-    until(lambda: motions(camera)[-1]["message"]["drive"]["speed"] > 0, "the finger to move the car")
+    button = middle(page, ".deadman")
+    press, release = lambda: fingers.put(1, *button), lambda: fingers.lift(1)
+    hold(page, press, release, lambda: camera.commands and moves(camera), "the finger to move the car")
     fingers.lift(2)
     fingers.lift(1)
     until(lambda: not held(page), "the finger to let go")
-    page.keyboard.down("Space")
-    phase(page, "driving")
+    drive(page)
     page.keyboard.up("Space")
     page.get_by_role("button", name="Stop car-1").click()
     page.locator(".stop-words").get_by_text("Emergency stop: car-1 stands.").wait_for()
