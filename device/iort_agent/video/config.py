@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import stat
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,8 +70,10 @@ class BitrateConfig:
 
 
 def _turn_url(value: str) -> str:
-    if not value.startswith(("stun:", "turn:", "turns:")):
-        raise ContractError(f"must begin with stun:, turn: or turns:, got {value!r}")
+    if not re.fullmatch(r"(stun|(turns?)):[^\s:?]+(:[1-9][0-9]{0,4})?(?(2)(\?transport=(udp|tcp))?)", value):
+        raise ContractError(
+            f"must begin with stun:, turn: or turns:, such as turn:turn.example.com:3478, got {value!r}"
+        )
     return value
 
 
@@ -143,6 +147,9 @@ class VideoConfig:
         else:
             size = f"{self.width}x{self.height} at {self.rate_hz:g} Hz"
             yield Finding("video", OK, f"{self.source.kind}, {size}, {self.codec}")
+        if isinstance(self.source, V4l2Camera) and not os.access(self.source.device, os.R_OK | os.W_OK):
+            text = f"{self.source.device} is not there, or this user may not read it"
+            yield Finding("video.source", FAIL, text, "see `ls -l /dev/video*`; `usermod -aG video USER`")
         if self.turn is not None and self.turn.credential_file is not None:
             mode = stat.S_IMODE(self.turn.credential_file.stat().st_mode)
             if mode & 0o077:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from typing import Sequence
 
@@ -26,7 +27,7 @@ def bounded(sdp: str) -> str:
 
     A browser hides its addresses behind names that end with .local. To look for them would take seconds, and
     is not needed: the browser asks the robot's candidates, and so the robot learns its address. Therefore
-    the list of candidates stays open, too.
+    the list of candidates stays open, too. Other names, and groups of hosts, are left out as well.
     """
     lines = sdp.splitlines()
     if len(lines) > MAX_LINES:
@@ -42,9 +43,18 @@ def bounded(sdp: str) -> str:
     candidates = [line for line in lines if line.startswith("a=candidate:")]
     if len(candidates) > MAX_CANDIDATES:
         raise ContractError(f"offer must have at most {MAX_CANDIDATES} candidates, got {len(candidates)}")
-    hidden = {line for line in candidates if (line.split()[4:5] or [""])[0].endswith(".local")}
-    kept = [line for line in lines if line not in hidden and line != "a=end-of-candidates"]
+    left_out = {line for line in candidates if not _one_host((line.split()[4:5] or [""])[0])}
+    kept = [line for line in lines if line not in left_out and line != "a=end-of-candidates"]
     return "\r\n".join(kept) + "\r\n"
+
+
+def _one_host(address: str) -> bool:
+    """Whether it is the address of one host, and no name: the robot looks nothing up for a viewer."""
+    try:
+        ip = ipaddress.ip_address(address)
+    except ValueError:
+        return False
+    return ip.is_loopback or not (ip.is_multicast or ip.is_unspecified or ip.is_reserved)
 
 
 def of_deployment(servers: Sequence[IceServer]) -> tuple[IceServer, ...]:

@@ -168,6 +168,7 @@ class RosCamera(Camera):
         self._pacer = Pacer(config.rate_hz)
         self._throttled = ThrottledLog(_log, clock)
         self._within_s, self._why = FIRST_S, ""
+        self._stamp_us: int | None = None
 
     def open(self) -> None:
         self._graph.subscribe(self._topic, self._on_message)
@@ -191,7 +192,11 @@ class RosCamera(Camera):
                 self._why = str(error)
                 self._throttled.warn("bad", f"the topic {self._topic} gave no good picture: {error}")
                 continue
-            self._within_s, self._why = SILENT_S, ""
+            if stamp_us and stamp_us == self._stamp_us:
+                # A relay or a camera that repeats its last picture shows nothing new.
+                self._why = "it has the stamp of the one before"
+                continue
+            self._within_s, self._why, self._stamp_us = SILENT_S, "", stamp_us
             at = captured(stamp_us, arrival)
             whole = fitted(picture, self._config.width, self._config.height)
             return Frame(number, at.us, at.monotonic, whole, jpeg)

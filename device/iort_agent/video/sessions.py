@@ -29,7 +29,7 @@ from iort_agent.common.threads import Clock
 from iort_agent.errors import VideoError
 from iort_agent.video import RTP_HZ, Encoded
 from iort_agent.video.rate import Rate
-from iort_agent.video.tap import Tap, gather, hurry
+from iort_agent.video.tap import Tap, gather, hurry, overfull
 from iort_contract.limits import ContractError
 from iort_contract.messages.video import CHANNEL, MARKS_REPEATED, IceServer, Mark, answer_clock, encode_marks
 
@@ -131,6 +131,8 @@ class Session:
         self._origin: int | None = None
         self._marks: deque[Mark] = deque(maxlen=MARKS_REPEATED)
         self._heard = clock.monotonic()
+        # A wall clock that is set meanwhile must not make a picture look younger, or older.
+        self._start_us = clock.now_us() - round(self._heard * 1e6)
         self._second, self._in_second = 0, 0
         self.connected = False
         self.sent = self.skipped = self.garbage = 0
@@ -151,6 +153,9 @@ class Session:
 
     def show(self, picture: Shown) -> None:
         """Send a picture, unless the viewer cannot take it now."""
+        if overfull(self._peer):
+            self._on_end("messages that never end")
+            return
         if not self._begun:
             return
         quiet = self._clock.monotonic() - self._heard > QUIET_S
@@ -204,9 +209,13 @@ class Session:
     def _mark(self, picture: Shown) -> None:
         frame = picture.encoded.frame
         rtp = ((self._origin or 0) + (picture.packet.pts or 0)) & _UINT32
-        self._marks.append(Mark(frame.number, frame.captured_us, rtp))
+        self._marks.append(Mark(frame.number, self._at_us(frame.monotonic), rtp))
         self._send(encode_marks(list(self._marks)))
         hurry(self._peer)
+
+    def _at_us(self, monotonic: float) -> int:
+        """A time in the session's clock, which is the robot's of its beginning."""
+        return self._start_us + round(monotonic * 1e6)
 
     def _send(self, message: bytes) -> None:
         channel = self._channel
@@ -219,6 +228,7 @@ class Session:
     def _on_channel(self, channel: RTCDataChannel) -> None:
         if channel.label != CHANNEL or self._channel is not None:
             channel.close()
+            self._note_garbage()
             return
         self._channel = channel
         channel.on("message", self._on_message)
@@ -230,9 +240,12 @@ class Session:
         self._in_second += 1
         if self._in_second <= MESSAGES_PER_S and isinstance(message, bytes):
             with suppress(ContractError):
-                self._send(answer_clock(message, self._clock.now_us()))
+                self._send(answer_clock(message, self._at_us(now)))
                 self._hear(now)
                 return
+        self._note_garbage()
+
+    def _note_garbage(self) -> None:
         self.garbage += 1
         if self.garbage == MAX_GARBAGE:
             self._on_end("too many messages that are no questions for the clock")

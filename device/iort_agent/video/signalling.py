@@ -19,7 +19,7 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Awaitable, Callable, NamedTuple, Protocol, Sequence
+from typing import Any, Awaitable, Callable, Mapping, NamedTuple, Protocol, Sequence
 
 from iort_agent.common.logs import ThrottledLog
 from iort_agent.errors import VideoError
@@ -143,6 +143,8 @@ class Signalling:
         self._offers: deque[tuple[str, str]] = deque(maxlen=_REMEMBERED)
         self._closing: set[asyncio.Future[Any]] = set()
         self._told = Demand()
+        # What a posted call raised.
+        self._failure: Exception | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._woken: asyncio.Event | None = None
         # Requests that were dropped, malformed, or refused.
@@ -179,18 +181,30 @@ class Signalling:
             self.post(woken.set)
 
     def post(self, call: Callable[[], object]) -> None:
-        """Let the loop call a function, if it runs."""
+        """Let the loop call a function, if it runs; what that raises, `run` raises."""
         loop = self._loop
         if loop is not None:
             # It may end in this moment.
             with suppress(RuntimeError):
-                loop.call_soon_threadsafe(call)
+                loop.call_soon_threadsafe(self._call, call)
+
+    def _call(self, call: Callable[[], object]) -> None:
+        try:
+            call()
+        except Exception as error:  # noqa: BLE001 - asyncio would log it, and go on
+            self._failure = error
+            if self._woken is not None:
+                self._woken.set()
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Answer until ``stopped``, which is looked at after `wake`. At its end every session is closed."""
+        self._failure = None
         self._loop, self._woken = asyncio.get_event_loop(), asyncio.Event()
+        self._loop.set_exception_handler(self._on_stray)
         try:
             while not stopped():
+                if self._failure is not None:
+                    raise self._failure
                 while self._inbox:
                     self._take(self._inbox.popleft())
                 self.sweep()
@@ -206,6 +220,10 @@ class Signalling:
             self._tell()
             if self._closing:
                 await asyncio.wait(set(self._closing))
+
+    def _on_stray(self, _: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:
+        # Of WebRTC: a session that fails so is closed by its lease at the latest.
+        self._throttled.warn("stray", f"video: {context['message']}: {context.get('exception')!r}")
 
     def end_all(self, why: str) -> None:
         """End what every viewer has."""

@@ -6,7 +6,8 @@ packs its pictures. But then nobody learns what the sender knows, and what has n
 - the viewer's reports (RTCP): the bitrate that it can take, its losses, and that it needs a key picture;
 - the RTP timestamp of a picture, by which the viewer tells pictures apart;
 - how long a lost message of the data channel blocks those behind it, which is up to a minute;
-- the loopback address, which is the only one of a machine without a network.
+- the loopback address, which is the only one of a machine without a network;
+- how much of a viewer's messages waits for the rest of them, which has no bound.
 
 If another version of aiortc has other names, the log says so once, and the session goes on without what is
 missing. Without timestamps a viewer does not know the pictures' ages, and falls back to pictures over the
@@ -30,6 +31,8 @@ _NACK, _PLI, _FIR, _APPLICATION = 1, 1, 4, 15
 _GAP = 64
 _HANDLE, _STAMP = "_handle_rtcp_packet", "_RTCRtpSender__rtp_timestamp"
 _TIMEOUT, _MOST_S = "_rto", 1.0
+# A message of the allowed 64 KiB comes in some 60 chunks.
+_STREAMS, _MOST_STREAMS, _MOST_CHUNKS = "_inbound_streams", 256, 1000
 _UINT32 = 0xFFFFFFFF
 _told: set[str] = set()
 
@@ -110,6 +113,18 @@ def hurry(peer: RTCPeerConnection) -> None:
         _missing(_TIMEOUT)
     elif timeout_s > _MOST_S:
         setattr(sctp, _TIMEOUT, _MOST_S)
+
+
+def overfull(peer: RTCPeerConnection) -> bool:
+    """Whether more of the viewer's messages waits for its rest than any viewer sends."""
+    sctp = peer.sctp
+    if sctp is None:
+        return False
+    streams = getattr(sctp, _STREAMS, None)
+    if streams is None:
+        _missing(_STREAMS)
+        return False
+    return len(streams) > _MOST_STREAMS or sum(len(s.reassembly) for s in streams.values()) > _MOST_CHUNKS
 
 
 async def gather(peer: RTCPeerConnection) -> None:

@@ -25,7 +25,7 @@ from iort_agent.errors import VideoError
 from iort_agent.mqtt.rate_limiter import LIVE
 from iort_agent.mqtt.uplink import Link
 from iort_agent.ros import Graph
-from iort_agent.video import EXTRA, Encoded, Frame, Pictures
+from iort_agent.video import EXTRA, Encoded, Frame, Pictures, require
 from iort_agent.video.camera import Camera, Pacer
 from iort_agent.video.capture import Capture
 from iort_agent.video.config import VP8, VideoConfig
@@ -45,6 +45,8 @@ Record = Callable[[str, int, Mapping[str, Value]], object]
 
 # No key pictures sooner: each has the bits of many others.
 KEY_EVERY_S = 0.5
+# The longest end of the thread `video`: a server that does not answer must not keep the agent from ending.
+END_S = 8.0
 # How long after a failure of the camera viewers are told of it, instead of what it can show.
 AGAIN_S = 3.0
 # The bitrate before a viewer has said what it can take.
@@ -126,7 +128,9 @@ class Video:
         """End every session and both threads."""
         self._stop.set()
         self._signalling.wake()
-        self._thread.join()
+        self._thread.join(END_S)
+        if self._thread.is_alive():
+            _log.error("video: its thread does not end, and is left behind")
         self._capture.close()
         if self._graph is not None:
             self._graph.close()
@@ -171,7 +175,9 @@ class Video:
     def _why_not(self) -> str:
         try:
             from iort_agent.video import sessions  # noqa: F401, PLC0415 - only somebody who looks costs its memory
-        except ImportError as error:
+
+            require("PIL.Image")
+        except (ImportError, VideoError) as error:
             return f"the robot has not the package for video: pip install '{EXTRA}' ({error})"
         return self._trouble if self._clock.monotonic() < self._again_at else ""
 
@@ -226,16 +232,20 @@ class Video:
             if self._make_camera is None:
                 self._make_camera = self._camera()
             camera = self._make_camera()
-        except VideoError as error:
-            self._fail(str(error))
+        except Exception as error:
+            self._fail(error)
             raise
         return _Watched(camera, failed=self._fail, closed=self._forget_encoder)
 
-    def _fail(self, why: str) -> None:
-        trouble = f"the camera does not work: {why}"
+    def _fail(self, error: Exception) -> None:
+        known = isinstance(error, VideoError)
+        # A mistake may pass at once: only the next one without a picture between ends the sessions.
+        ends, why = known or self._trouble, "" if known else f"{type(error).__name__}: "
+        trouble = f"the camera does not work: {why}{error}"
         self._throttled.warn("camera", f"video: {trouble}")
         self._trouble, self._again_at = trouble, self._clock.monotonic() + AGAIN_S
-        self._signalling.post(lambda: self._signalling.end_all(trouble))
+        if ends:
+            self._signalling.post(lambda: self._signalling.end_all(trouble))
 
     def _forget_encoder(self) -> None:
         encoder, self._encoder = self._encoder, None
@@ -245,13 +255,12 @@ class Video:
     def _on_frame(self, frame: Frame) -> None:
         try:
             self._take(frame)
-        except VideoError as error:
-            self._fail(str(error))
+        except Exception as error:
+            self._fail(error)
             raise
 
     def _take(self, frame: Frame) -> None:
         demand = self._demand
-        self._trouble = ""
         values: dict[str, Value] = {}
         if demand.viewers:
             values = self._encode(frame)
@@ -260,6 +269,7 @@ class Video:
         if demand.watchers and self._pacer.takes(frame.monotonic):
             published = self._publish(frame)
             values = values or published
+        self._trouble = ""
         if not values:
             return
         if self._keep is not None:
@@ -292,10 +302,10 @@ class Video:
         encode_ms = (self._clock.monotonic() - frame.monotonic) * 1000
         self._encode_ms.append(encode_ms)
         with self._lock:
-            waits, self._handed = self._handed is not None, encoded
-            self._missed = self._missed or waits
-        if not waits:
-            self._signalling.post(self._show)
+            self._missed = self._missed or self._handed is not None
+            self._handed = encoded
+        # Always: a thread that starts again may have lost the last one.
+        self._signalling.post(self._show)
         return {
             "bytes": len(encoded.data),
             "key": encoded.key,
@@ -325,7 +335,7 @@ class _Watched(Camera):
     """A camera that tells what goes wrong with it, and when it is closed."""
 
     def __init__(
-        self, camera: Camera, *, failed: Callable[[str], object], closed: Callable[[], object]
+        self, camera: Camera, *, failed: Callable[[Exception], object], closed: Callable[[], object]
     ) -> None:
         self._camera, self._failed, self._closed = camera, failed, closed
 
@@ -339,14 +349,16 @@ class _Watched(Camera):
         return self._camera.report()
 
     def close(self) -> None:
-        self._closed()
-        self._camera.close()
+        try:
+            self._closed()
+        finally:
+            self._camera.close()
 
     def _tried(self, call: Callable[[], T]) -> T:
         try:
             return call()
-        except VideoError as error:
-            self._failed(str(error))
+        except Exception as error:
+            self._failed(error)
             raise
 
 

@@ -142,8 +142,14 @@ class Looks:
 class Rig(Looks):
     """A robot with video; ``settings`` are those of car.yaml's section."""
 
-    def __init__(self, *, encoder: Callable[[VideoConfig], Encoder] = make_encoder, **settings: Any) -> None:
-        self.clock = SystemClock()
+    def __init__(
+        self,
+        *,
+        clock: Clock | None = None,
+        encoder: Callable[[VideoConfig], Encoder] = make_encoder,
+        **settings: Any,
+    ) -> None:
+        self.clock = clock or SystemClock()
         super().__init__(Loopback(self.clock, Dispatcher()))
         self.link = link_of(self.uplink, self.clock)
         self.camera, self.pictures = Counter(self.clock), Pictures()

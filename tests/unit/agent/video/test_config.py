@@ -12,7 +12,7 @@ import yaml
 from iort_agent.config import Config, load_config
 from iort_agent.errors import ConfigError, VideoError
 from iort_agent.video import KEPT_S, Frame, Pictures, require
-from iort_agent.video.config import TurnConfig, VideoConfig
+from iort_agent.video.config import TurnConfig, V4l2Camera, VideoConfig
 from iort_contract.messages.video import IceServer, VideoTerms, check_terms
 
 SIM: dict[str, Any] = {"type": "sim"}
@@ -107,6 +107,16 @@ def test_a_topic_is_heard_by_the_node_of_the_sources(folder: Path, source: dict[
         ({"source": SIM, "codec": "gstreamer"}, [SIM], "video.pipeline: required with codec: gstreamer"),
         ({"source": SIM, "pipeline": "x264enc"}, [SIM], "video.pipeline: needs codec: gstreamer, got vp8"),
         ({"source": SIM, "turn": {"url": "http://x"}}, [SIM], "video.turn.url: must begin with stun:"),
+        *(
+            ({"source": SIM, "turn": {"url": url}}, [SIM], "such as turn:turn.example.com:3478")
+            for url in (
+                "turn:",
+                "stun:x?transport=udp",
+                "turn:x:y",
+                "turns:[::1]:443",
+                "turn:x?transport=tls",
+            )
+        ),
         ({"source": SIM, "turn": {"url": "turn:x"}}, [SIM], "video.turn.username: required for a TURN"),
         (
             {"source": SIM, "turn": {"url": "turn:x", "username": "a", "credential_file": "none"}},
@@ -142,6 +152,16 @@ def test_the_check_tells_who_may_read_the_password(folder: Path) -> None:
     assert [finding.level for finding in video.check()] == ["ok", "warn"]
     (folder / "turn.password").chmod(0o600)
     assert [finding.level for finding in video.check()] == ["ok"]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_the_check_tells_of_a_camera_that_is_not_there(tmp_path: Path, there: bool) -> None:
+    device = tmp_path / "video9"
+    if there:
+        device.touch()
+    findings = [*VideoConfig(V4l2Camera(str(device))).check()]
+    assert [finding.level for finding in findings] == (["ok"] if there else ["ok", "fail"])
+    assert there or "video9 is not there" in findings[-1].text
 
 
 def test_a_package_that_is_missing_is_named_with_its_cure() -> None:

@@ -24,6 +24,19 @@ def test_an_offer_is_kept_but_for_hidden_addresses_and_the_end_of_the_list() -> 
     assert bounded(sdp) == offer(VIDEO, HOST, DATA)
 
 
+@pytest.mark.parametrize("host", ["192.168.1.5", "127.0.0.1", "::1", "fe80::1", "2001:db8::1"])
+def test_the_address_of_a_host_is_kept(host: str) -> None:
+    sdp = offer(VIDEO, HOST.replace("192.0.2.1", host))
+    assert bounded(sdp) == sdp
+
+
+@pytest.mark.parametrize(
+    "host", ["router.lan", "239.255.0.1", "255.255.255.255", "0.0.0.0", "::", "ff02::1", "x.LOCAL", "1.2.3"]
+)
+def test_the_robot_looks_up_no_name_and_asks_no_group_of_hosts(host: str) -> None:
+    assert bounded(offer(VIDEO, HOST.replace("192.0.2.1", host))) == offer(VIDEO)
+
+
 @pytest.mark.parametrize(
     ("lines", "why"),
     [

@@ -277,6 +277,30 @@ def test_a_stamp_that_can_be_is_the_capture_time(age_s: float, believed: bool) -
     assert frame.monotonic == pytest.approx(now - off_s)
 
 
+@pytest.mark.parametrize("age_s", [0.0, 30.0])
+def test_a_picture_that_is_repeated_shows_nothing_new(age_s: float) -> None:
+    rig = Rig()
+    rig.image("rgb8", GOOD, age_s=age_s)
+    rig.read()
+    began = rig.clock.monotonic()
+
+    def again() -> None:
+        rig.image("rgb8", GOOD, age_s=age_s + rig.clock.monotonic() - began)
+        rig.clock.then.append(again)
+
+    rig.clock.then.append(again)
+    with pytest.raises(VideoError, match="for 2 s, the last: it has the stamp of the one before"):
+        rig.read()
+
+
+def test_pictures_without_stamps_are_each_new() -> None:
+    rig = Rig()
+    for _ in range(3):
+        rig.clock.advance(0.2)
+        rig.image("rgb8", GOOD, age_s=rig.clock.now_us() / 1e6)
+        assert rig.read().monotonic == rig.clock.monotonic()
+
+
 def test_reading_ends_when_nobody_looks_and_the_topic_is_left() -> None:
     rig = Rig()
     rig.clock.then.append(rig.stop.set)

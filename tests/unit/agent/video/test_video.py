@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import math
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
+from aiortc.rtcsctptransport import SCTP_DATA_FIRST_FRAG, SCTP_DATA_UNORDERED, DataChunk
 from PIL import Image
 
 from iort_agent.agent import make_status
-from iort_agent.common.threads import WATCH
+from iort_agent.common.threads import WATCH, SystemClock
 from iort_agent.errors import VideoError
 from iort_agent.metrics import MetricsConfig
 from iort_agent.ros.json_message import decode
@@ -22,6 +25,7 @@ from iort_agent.sources.sim import SimConfig
 from iort_agent.status import render
 from iort_agent.verbs.check import _video
 from iort_agent.video import Frame
+from iort_agent.video import video as module
 from iort_agent.video.encoder import make_encoder
 from iort_agent.video.kept import keeper
 from iort_agent.video.sessions import MAX_GARBAGE, MESSAGES_PER_S
@@ -169,6 +173,68 @@ def test_garbage_on_the_data_channel_is_counted_and_bounded(rig, loop):
     until(lambda: rig.video.report()["viewers"] == 0, "the session's end")
 
 
+def end_of(rig, viewer):
+    """Wait until the robot has ended a viewer's session; the reason."""
+    shows = rig.shows[viewer.name]
+    return until(lambda: next((show.why for show in shows if show.kind == ENDED), None), "the end")
+
+
+def test_many_data_channels_end_the_session(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+    for i in range(MAX_GARBAGE):
+        loop.loop.call_soon_threadsafe(viewer.peer.createDataChannel, f"files {i}")
+    assert end_of(rig, viewer) == "too many messages that are no questions for the clock"
+
+
+@pytest.mark.parametrize("flags", [SCTP_DATA_FIRST_FRAG, SCTP_DATA_UNORDERED])
+def test_a_message_without_an_end_ends_the_session(rig, loop, flags):
+    viewer = Viewer(rig, loop).connect()
+    until(lambda: viewer.channel.readyState == "open", "the channel")
+
+    async def flood():
+        sctp = viewer.peer.sctp
+        while not any(show.kind == ENDED for show in rig.shows[viewer.name]):
+            # The robot takes them in another thread.
+            await asyncio.sleep(0.001)
+            chunk = DataChunk()
+            chunk.flags, chunk.stream_id, chunk.stream_seq, chunk.protocol = flags, 1, 0, 53
+            chunk.tsn, chunk.user_data = sctp._local_tsn, b"x"
+            sctp._local_tsn = (sctp._local_tsn + 1) & 0xFFFFFFFF
+            with suppress(ConnectionError):
+                await sctp._send_chunk(chunk)
+
+    loop.do(flood())
+    assert end_of(rig, viewer) == "messages that never end"
+    # Nobody else is harmed.
+    Viewer(rig, loop).connect().sees()
+
+
+def test_a_clock_that_is_set_makes_no_picture_younger(make_rig, loop):
+    class Set(SystemClock):
+        ahead_us = 0
+
+        def now_us(self):
+            return super().now_us() + self.ahead_us
+
+    clock = Set()
+    rig = make_rig(clock=clock)
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+    viewer.ask_clock(1)
+    until(lambda: len(viewer.clocks) == 1, "the robot's clock")
+    clock.ahead_us = 3_600_000_000
+    seen = viewer.sees(5)
+    newest = max(viewer.marks.values())
+    assert newest.number >= seen[0].number
+    viewer.ask_clock(2)
+    until(lambda: len(viewer.clocks) == 2, "the robot's clock")
+    first_us, then_us = (us for _, us in viewer.clocks)
+    assert first_us < newest.captured_us <= then_us < first_us + clock.ahead_us
+    # What is recorded has the robot's time.
+    assert max(t_us for t_us, _ in rig.samples) >= first_us + clock.ahead_us
+
+
 def test_a_data_channel_of_another_name_is_closed(rig, loop):
     viewer = Viewer(rig, loop, channel="files").connect()
     viewer.sees(3)
@@ -239,12 +305,60 @@ def test_a_camera_thread_that_fails_goes_on_for_the_same_viewers(rig, loop):
     assert [show.kind for show in rig.shows[viewer.name]] == [ANSWER]
 
 
-def test_a_killed_thread_ends_the_sessions_and_new_ones_begin(rig, loop):
+def test_a_camera_that_fails_in_any_way_is_told_to_viewers(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+    rig.camera.error = KeyError("width")
+    assert end_of(rig, viewer) == "the camera does not work: KeyError: 'width'"
+
+
+def test_an_encoder_that_fails_is_told_to_viewers(make_rig, loop):
+    def fail(config):
+        raise MemoryError("no room")
+
+    rig = make_rig(encoder=fail)
+    viewer = Viewer(rig, loop).connect()
+    assert end_of(rig, viewer) == "the camera does not work: MemoryError: no room"
+
+
+def test_a_picture_that_the_thread_did_not_take_blocks_no_later_one(rig, loop):
+    viewer = Viewer(rig, loop).connect()
+    viewer.sees()
+    signalling = rig.video._signalling
+    # As between two runs of the thread.
+    running, signalling._loop = signalling._loop, None
+    until(lambda: rig.video._handed, "a picture")
+    signalling._loop = running
+    viewer.sees(3)
+
+
+def test_without_pillow_viewers_are_told_what_to_install(rig, monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL.Image", None)
+    refused = rig.ask(rig.name(), PICTURES)
+    assert refused.kind == REFUSED
+    assert "needs the package pillow: pip install 'iort-agent[video]'" in refused.why
+    assert rig.camera.opened == 0
+
+
+def test_a_thread_that_hangs_does_not_keep_the_agent_from_ending(make_rig, monkeypatch, caplog):
+    monkeypatch.setattr(module, "END_S", 0.1)
+    rig, hangs = make_rig(), threading.Event()
+    assert rig.ask(rig.name(), ASK).kind == TERMS
+    rig.video._signalling.post(hangs.wait)
+    try:
+        rig.video.close()
+        assert "its thread does not end" in caplog.text
+    finally:
+        hangs.set()
+
+
+@pytest.mark.parametrize("error", [SystemExit("killed"), ValueError("a mistake")])
+def test_a_killed_thread_ends_the_sessions_and_new_ones_begin(rig, loop, error):
     viewer = Viewer(rig, loop).connect()
     viewer.sees()
 
     def die():
-        raise SystemExit("killed")
+        raise error
 
     rig.video._signalling.post(die)
     until(lambda: [alarm for alarm in WATCH.alarms() if "the thread video" in alarm], "the alarm")
