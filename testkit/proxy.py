@@ -130,17 +130,18 @@ class Proxy:
             return
         self._open.add(writer)
         out: asyncio.StreamWriter | None = None
+        pumps: list[asyncio.Task[None]] = []
         try:
             await self._flowing.wait()
             back, out = await self._connect()
             self._open.add(out)
-            await asyncio.wait(
-                [asyncio.create_task(self._pump(reader, out)), asyncio.create_task(self._pump(back, writer))],
-                return_when=asyncio.FIRST_COMPLETED,
-            )
+            pumps = [asyncio.create_task(self._pump(*ends)) for ends in ((reader, out), (back, writer))]
+            await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
         except (OSError, asyncio.CancelledError):
             pass  # the target is down, or we stop: the connection ends in both cases
         finally:
+            for pump in pumps:
+                pump.cancel()
             for one in (writer, out):
                 if one is not None:
                     self._open.discard(one)

@@ -185,9 +185,10 @@ class Viewer:
         return self._page.locator(".sight").get_attribute("data-way")
 
     def live(self) -> None:
-        """Wait until pictures come, and one of the last second is on the screen."""
+        """Wait until pictures come, and the page calls them live."""
         now_us = time.time_ns() // 1000
         until(lambda: any(one.number for one in self.shown if one.shown_us > now_us), "pictures on the page")
+        self._page.locator(".sight[data-state=live]").wait_for()
 
     def sit(self) -> None:
         """Take the wheel."""
