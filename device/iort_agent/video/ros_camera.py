@@ -198,6 +198,13 @@ class RosCamera(Camera):
                 continue
             self._within_s, self._why, self._stamp_us = SILENT_S, "", stamp_us
             at = captured(stamp_us, arrival)
+            old_s = arrival.monotonic - at.monotonic
+            if old_s * 1000 > self._config.max_age_ms:
+                self._throttled.warn(
+                    "late",
+                    f"the topic {self._topic} gives pictures that are {old_s:.1f} s old by their stamps: "
+                    "nobody can drive by them; is the clock of the camera's machine right?",
+                )
             whole = fitted(picture, self._config.width, self._config.height)
             return Frame(number, at.us, at.monotonic, whole, jpeg)
 

@@ -277,6 +277,19 @@ def test_a_stamp_that_can_be_is_the_capture_time(age_s: float, believed: bool) -
     assert frame.monotonic == pytest.approx(now - off_s)
 
 
+def test_pictures_that_are_late_when_they_come_are_told(caplog: pytest.LogCaptureFixture) -> None:
+    rig = Rig()
+    rig.image("rgb8", GOOD, age_s=0.5)
+    rig.read()
+    assert rig.camera.report() == {}
+    rig.image("rgb8", GOOD, age_s=1.2)
+    rig.clock.advance(0.2)
+    rig.image("rgb8", GOOD, age_s=1.2)
+    rig.read()
+    assert rig.camera.report() == {"late": 1}
+    assert "/camera/image gives pictures that are 1.2 s old by their stamps" in caplog.text
+
+
 @pytest.mark.parametrize("age_s", [0.0, 30.0])
 def test_a_picture_that_is_repeated_shows_nothing_new(age_s: float) -> None:
     rig = Rig()
