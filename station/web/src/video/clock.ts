@@ -11,7 +11,7 @@ interface Word {
 }
 
 // Two clocks drift by less while a word is believed.
-const DRIFT_MS = 5;
+export const DRIFT_MS = 5;
 
 /** The car's clock less this page's, by the word of the car that was the least time on its way lately. */
 export class RobotClock {
@@ -33,6 +33,11 @@ export class RobotClock {
   /** Undefined before the first word. */
   get offset_ms(): number | undefined {
     return this.words[0]?.offset_ms;
+  }
+
+  /** The most that the truth can be above the offset. */
+  get within_ms(): number | undefined {
+    return this.words[0]?.within_ms;
   }
 
   /** How long the best word's way took. */

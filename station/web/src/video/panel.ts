@@ -29,6 +29,7 @@ const SAID: Readonly<Record<State, string>> = {
   late: "The picture is late",
   frozen: "The picture is frozen",
 };
+const UNKNOWN = "How old the picture is is not known yet";
 const WAYS: Readonly<Record<Way, string>> = { webrtc: "WebRTC", broker: "Small pictures over the broker" };
 
 /** What the cars' cameras can show, by their shadows. */
@@ -92,7 +93,8 @@ export class PicturePanel {
       this.line,
     );
     this.node.hidden = true;
-    new IntersectionObserver(([entry]) => (this.visible = entry!.intersectionRatio >= VISIBLE), {
+    // The newest is the last.
+    new IntersectionObserver((seen) => (this.visible = seen.at(-1)!.intersectionRatio >= VISIBLE), {
       threshold: [VISIBLE],
     }).observe(this.frame);
     document.addEventListener("visibilitychange", () => this.attend());
@@ -178,7 +180,8 @@ export class PicturePanel {
       peer: able() ? (servers, ends) => new Peer(servers, this.video, ends) : undefined,
       draw: async (jpeg) => {
         const bitmap = await bitmapOf(jpeg, MOST_PIXELS);
-        if (bitmap) draw(this.canvas, bitmap);
+        // Another car may be looked at by now.
+        if (bitmap && this.looking?.sight === sight) draw(this.canvas, bitmap);
         return bitmap !== undefined;
       },
       newName,
@@ -219,7 +222,7 @@ export class PicturePanel {
     const meaning = this.meaning ? `: ${this.meaning}` : "";
     const texts: Readonly<Record<State, string>> = {
       off: "",
-      waiting: `${sight.words}${sight.had ? meaning : ""}`,
+      waiting: `${sighted ? UNKNOWN : sight.words}${sight.had ? meaning : ""}`,
       live: "",
       late: `Late, ${late}${meaning}`,
       frozen: `Frozen for ${age(still_ms / 1000)}${meaning}`,

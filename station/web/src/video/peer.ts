@@ -109,6 +109,9 @@ export class Peer {
     };
     video.requestVideoFrameCallback(shown);
     // A muted video may play by itself; where it may not, no picture comes, and pictures over the broker do.
-    video.play().catch(() => undefined);
+    const play = (): void => void video.play().catch(() => undefined);
+    // A browser that saves power may pause it.
+    video.onpause = () => !this.closed && play();
+    play();
   }
 }

@@ -10,7 +10,7 @@
 // and nothing that is sent again fits: an answer counts once, for the request that it repeats.
 
 import { ECHO_EVERY_MS, VIEW_RENEW_S, type VideoTermsEntry } from "../base/contract";
-import { Marks, RobotClock } from "./clock";
+import { DRIFT_MS, Marks, RobotClock } from "./clock";
 import {
   askClock,
   decodeClock,
@@ -93,7 +93,7 @@ interface Small extends Session {
 export interface Sighted {
   readonly way: Way;
   readonly number: number;
-  /** Undefined before the car's clock is known. */
+  /** The most that it can be; undefined before the car's clock is known, and for a picture of the future. */
   readonly age_ms: number | undefined;
   /** How long it has been the newest one. */
   readonly still_ms: number;
@@ -170,6 +170,9 @@ export class Sight {
     const { rtc } = this;
     if (rtc && !rtc.seen && at - rtc.began_ms > CONNECT_MS)
       this.fail(rtc, `no picture came within ${CONNECT_MS / 1000} s`);
+    // The camera sees, and pictures still come another way.
+    if (rtc?.seen && (this.small?.seen?.at_ms ?? 0) - rtc.seen.at_ms > 2 * STALLED_MS)
+      this.fail(rtc, `it showed no new picture for ${(2 * STALLED_MS) / 1000} s`);
     if (rtc && at - this.echoed_ms >= ECHO_EVERY_MS) this.question(rtc);
     if (!this.works || this.closed) return;
     // Each answer also tells how long the way over the broker is.
@@ -193,13 +196,18 @@ export class Sight {
     const way = rtc && !(small && small.at_ms > rtc.at_ms + NEWER_MS) ? "webrtc" : "broker";
     const [session, seen] = way === "webrtc" ? [this.rtc!, rtc] : [this.small, small];
     if (!seen) return undefined;
-    const offset_ms = session!.clock.offset_ms;
-    const lag_ms = way === "broker" ? (this.trips.cost_ms ?? 0) / 2 : 0;
+    const { offset_ms, within_ms } = session!.clock;
+    // A message over the broker was on its way for no longer than a question and its answer.
+    const error_ms = way === "broker" ? this.trips.cost_ms : within_ms;
+    const still_ms = at - seen.at_ms;
+    const known = offset_ms !== undefined && error_ms !== undefined;
+    const age_ms = known ? at + offset_ms + error_ms - seen.captured_ms : undefined;
     return {
       way,
       number: seen.number,
-      age_ms: offset_ms === undefined ? undefined : Math.max(0, at + offset_ms + lag_ms - seen.captured_ms),
-      still_ms: at - seen.at_ms,
+      // The car's clock was set if a picture is of the future. One that stands still is as old as that at least.
+      age_ms: age_ms === undefined || age_ms < -DRIFT_MS ? undefined : Math.max(age_ms, still_ms),
+      still_ms,
     };
   }
 
@@ -272,12 +280,19 @@ export class Sight {
     const session = { viewer: this.eyes.newName(), request: this.eyes.newName(), kept: "" };
     const servers = [...deployed, ...this.offered];
     const { ends, known } = this.ends();
+    let peer: Rtc["peer"];
+    try {
+      peer = this.eyes.peer!(servers, ends);
+    } catch (error) {
+      // An address of a server that is none.
+      return this.later(String(error));
+    }
     const rtc: Rtc = {
       ...session,
       began_ms: this.eyes.now_ms(),
       seen: undefined,
       clock: new RobotClock(),
-      peer: this.eyes.peer!(servers, ends),
+      peer,
       marks: new Marks(),
       answered: false,
       asked: new Map(),
@@ -357,8 +372,14 @@ export class Sight {
     if (this.rtc !== rtc) return;
     this.end(rtc);
     rtc.peer.close();
-    [this.rtc, this.otherwise] = [undefined, why];
+    this.rtc = undefined;
     if (rtc.seen) this.words = "The picture is gone, and is asked for again …";
+    this.later(why);
+  }
+
+  /** Try WebRTC again, with more patience each time. */
+  private later(why: string): void {
+    this.otherwise = why;
     this.rtcAt_ms = this.eyes.now_ms() + this.again_ms;
     this.again_ms = Math.min(2 * this.again_ms, AGAIN_MOST_MS);
   }
