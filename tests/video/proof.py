@@ -88,7 +88,8 @@ class Figures:
     """What the proof found. ``glass`` is the age of pictures on the screen, by viewer and round trip in ms;
     ``recovery_s`` the time from the end of a cut to a live picture, None if none came; ``page_again_s`` the
     same by the page's own word, and ``age_wrong_ms`` by how much the age that it tells is too high; ``bad``
-    the pictures on bad networks; ``lanes`` the delays in ms, by block and lane."""
+    the pictures on bad networks, ``by_broker`` the commands that passed by pictures over the broker;
+    ``lanes`` the delays in ms, by block and lane."""
 
     glass: dict[str, dict[int, Spread]] = field(default_factory=dict)
     recovery_s: dict[str, list[float | None]] = field(default_factory=dict)
@@ -98,6 +99,7 @@ class Figures:
     tries: list[Try] = field(default_factory=list)
     whole: Verdict | None = None
     lanes: list[dict[str, Any]] = field(default_factory=list)
+    by_broker: int = 0
     stats: dict[str, list[Any]] = field(default_factory=dict)
 
 
@@ -246,10 +248,17 @@ class Proof:
         viewer.live()
         wire.set(cut=True)
         until(lambda: viewer.way == "broker", "pictures over the broker")
-        self._pause.wait(_WARM_UP_S)
-        viewer.drive()
-        self._measured(NO_UDP, CHROMIUM)
+        passed = self.scene.passed()
+
+        def driven() -> bool:
+            viewer.drive()
+            self._pause.wait(_DRIVEN_S)
+            return self.scene.passed() > passed
+
+        until(driven, "the car to be driven by pictures over the broker")
+        self.figures.by_broker = self.scene.passed() - passed
         viewer.release()
+        self._measured(NO_UDP, CHROMIUM)
         wire.set(cut=False)
 
     # --- lanes -------------------------------------------------------------------------------------
@@ -317,9 +326,6 @@ class Proof:
                     "held_ms": asdict(Spread.of(held)),
                     "live_share": round(
                         live_share(self._shown[one.viewer], self._captured, one.span, LIMIT_MS), 3
-                    ),
-                    "passed": sum(
-                        each.passed for each in commands if one.span[0] <= each.at_us < one.span[1]
                     ),
                     "longest_gap_ms": round(longest_gap_ms(self._shown[one.viewer], one.span)),
                 }

@@ -117,6 +117,8 @@ def _tries(figures: Figures) -> str:
     wrong = figures.age_wrong_ms
     told = f"{whole.passed} commands passed, {len(whole.wrong)} wrong" if whole else ""
     told += f"; the page tells an age that is {_ms(wrong.p50)} ms too high (p95 {_ms(wrong.p95)}), {wrong.n}"
+    if figures.by_broker:
+        told += f"; {figures.by_broker} passed by pictures over the broker"
     return "\n".join([_table("Commands when the picture froze", head, rows), told])
 
 

@@ -92,7 +92,7 @@ def test_without_udp_the_car_is_seen_and_driven_over_the_broker(proof: Proof) ->
         pytest.skip("no network between machines here")
     (one,) = [each for each in proof.figures.bad if each["network"] == NO_UDP]
     assert one["pictures_hz"] > 0
-    assert one["passed"] > 0
+    assert proof.figures.by_broker > 0
 
 
 def test_both_viewers_read_the_number_in_the_picture(proof: Proof) -> None:
