@@ -29,7 +29,7 @@ from iort_agent.common.threads import Clock
 from iort_agent.errors import VideoError
 from iort_agent.video import RTP_HZ, Encoded
 from iort_agent.video.rate import Rate
-from iort_agent.video.tap import Tap, gather, hurry, overfull
+from iort_agent.video.tap import Tap, end_checks, gather, hurry, overfull
 from iort_contract.limits import ContractError
 from iort_contract.messages.video import CHANNEL, MARKS_REPEATED, IceServer, Mark, answer_clock, encode_marks
 
@@ -178,6 +178,8 @@ class Session:
         self._peer.remove_all_listeners()
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._peer.close(), CLOSE_S)
+        if not self.connected:
+            await end_checks(self._peer)
 
     async def _following(self) -> av.Packet[Any]:
         """The next picture. aiortc asks for it once the one before is sent."""

@@ -7,7 +7,8 @@ packs its pictures. But then nobody learns what the sender knows, and what has n
 - the RTP timestamp of a picture, by which the viewer tells pictures apart;
 - how long a lost message of the data channel blocks those behind it, which is up to a minute;
 - the loopback address, which is the only one of a machine without a network;
-- how much of a viewer's messages waits for the rest of them, which has no bound.
+- how much of a viewer's messages waits for the rest of them, which has no bound;
+- the checks of a connection that came about while it was closed, which never end.
 
 If another version of aiortc has other names, the log says so once, and the session goes on without what is
 missing. Without timestamps a viewer does not know the pictures' ages, and falls back to pictures over the
@@ -16,6 +17,7 @@ broker.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from typing import Any, Awaitable, Callable
 
@@ -33,6 +35,8 @@ _HANDLE, _STAMP = "_handle_rtcp_packet", "_RTCRtpSender__rtp_timestamp"
 _TIMEOUT, _MOST_S = "_rto", 1.0
 # A message of the allowed 64 KiB comes in some 60 chunks.
 _STREAMS, _MOST_STREAMS, _MOST_CHUNKS = "_inbound_streams", 256, 1000
+# aioice looks so often, and more, whether a connection has come about.
+_BEGINS_S = 0.1
 _UINT32 = 0xFFFFFFFF
 _told: set[str] = set()
 
@@ -113,6 +117,16 @@ def hurry(peer: RTCPeerConnection) -> None:
         _missing(_TIMEOUT)
     elif timeout_s > _MOST_S:
         setattr(sctp, _TIMEOUT, _MOST_S)
+
+
+async def end_checks(peer: RTCPeerConnection) -> None:
+    """After `close`: end the checks of a connection that had not come about before."""
+    await asyncio.sleep(_BEGINS_S)
+    for sender in peer.getSenders():
+        connection: Any = getattr(sender.transport.transport, "_connection", None)
+        checks = getattr(connection, "_query_consent_task", None)
+        if checks is not None:
+            checks.cancel()
 
 
 def overfull(peer: RTCPeerConnection) -> bool:

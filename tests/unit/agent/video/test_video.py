@@ -29,6 +29,7 @@ from iort_agent.video import video as module
 from iort_agent.video.encoder import make_encoder
 from iort_agent.video.kept import keeper
 from iort_agent.video.sessions import MAX_GARBAGE, MESSAGES_PER_S
+from iort_agent.video.signalling import OFFERS_PER_S
 from iort_agent.video.video import KEY_EVERY_S
 from iort_contract.counter import read_counter
 from iort_contract.messages.shadow import decode_reported
@@ -171,6 +172,20 @@ def test_garbage_on_the_data_channel_is_counted_and_bounded(rig, loop):
     )
     assert ended.why == "too many messages that are no questions for the clock"
     until(lambda: rig.video.report()["viewers"] == 0, "the session's end")
+
+
+def test_viewers_who_leave_while_they_connect_leave_nothing(rig, loop):
+    # So many offers the robot takes at once.
+    for _ in range(int(OFFERS_PER_S)):
+        viewer = Viewer(rig, loop).connect()
+        rig.look(viewer.name, END)
+        viewer.close()
+    signalling = rig.video._signalling
+    # Whoever is answered now came after them.
+    assert rig.ask(rig.name(), ASK).kind == TERMS
+    until(lambda: not signalling._closing, "the sessions' end")
+    names = [task.get_coro().__qualname__ for task in asyncio.all_tasks(signalling._loop)]
+    assert "Connection.query_consent" not in names
 
 
 def end_of(rig, viewer):
