@@ -296,7 +296,9 @@ class Model:
         said = self.leases.stop_due(self.now)
         assert said == (due is not None and due <= self.now)
         assert due is not None or not self.held, "an emergency stop goes on"
-        if self.limits.picture_ms is not None and self.moving_until is not None and not self.passed[-1].blind:
+        # What ends a lease is a stop: the robot gets no other message of it.
+        moves = self.moving_until is not None and not (self.passed[-1].blind or self.passed[-1].ends)
+        if self.limits.picture_ms is not None and moves:
             frozen = self.now - max(self.captured, default=0.0)
             assert frozen <= self.limits.picture_ms / 1000 + 0.5 + TICK, "no longer than a lease"
         if self.moving_until is not None and self.now >= self.moving_until:
@@ -384,7 +386,11 @@ SEEING = st.lists(
 )
 
 
+_END = {"session": "0badcafe", "takeover": False, "ends": True, "ago_us": 0, "lease_ms": 31}
+
+
 @given(SEEING)
+@example([0.5, 0.5, 0.5, {**_END, "behind": None, "blind": False}])
 def test_a_picture_that_freezes_ends_motion_within_its_limit_and_a_lease(events: list[Any]) -> None:
     happen(events, Model(SIGHTED))
 
