@@ -101,7 +101,7 @@ class CameraCar:
             if stop.is_set():
                 return None
         captured_us = self._clock.now_us() - self.late_us
-        return Frame(number, captured_us, self._clock.monotonic(), drawn(number))
+        return Frame(number, captured_us, self._clock.monotonic() - self.late_us / 1e6, drawn(number))
 
     def report(self) -> dict[str, Any]:
         return {}

@@ -69,6 +69,10 @@ def is_told_truly(page):
     until(same, "the number of the picture on the screen")
 
 
+# The colour of the edge that is drawn over the picture.
+EDGE = """() => getComputedStyle(document.querySelector(".sight-frame"), "::after").borderTopColor"""
+
+
 def open_car(open_page, address, car, **options):
     page = open_page(address, **options)
     show(page, car.send())
@@ -164,6 +168,7 @@ def test_driving_ends_when_the_picture_freezes_and_begins_with_a_new_hold(open_p
     assert all("blind" not in command for command in camera.commands)
     camera.sees.clear()
     sight(page, state="frozen")
+    assert page.evaluate(EDGE) == "rgb(179, 38, 30)"
     phase(page, "over")
     words = page.locator(".sight-words")
     until(lambda: words.inner_text().startswith("Frozen for "), "the words")
@@ -188,6 +193,7 @@ def test_a_late_picture_ends_driving_though_it_moves(open_page, server, car, cam
     drive(page)
     camera.late_us = 20_000_000
     sight(page, state="late")
+    assert page.evaluate(EDGE) == "rgb(255, 196, 0)"
     phase(page, "over")
     words = page.inner_text(".sight-words")
     assert words.startswith("Late, 20")
@@ -269,7 +275,7 @@ def test_a_phone_drives_on_the_whole_screen(open_page, server, car, camera, scri
     take_the_wheel(page)
     page.get_by_role("button", name="Full screen").click()
     until(lambda: bool(page.evaluate("document.fullscreenElement")) == (script == ""), "the screen")
-    for width, height in ((390, 844), (844, 390)):
+    for width, height in ((390, 844), (667, 320), (844, 390)):
         page.set_viewport_size({"width": width, "height": height})
         drawn(page)
         frame = page.locator(".sight-frame").bounding_box()

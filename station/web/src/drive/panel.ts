@@ -235,9 +235,13 @@ export class DrivePanel {
     const against = phase === "free" ? driver.against(at_ms) : "";
     const free =
       against ||
-      (phase === "free" && driver.reason ? `${driver.reason}.` : WORDS[phase === "over" ? "free" : phase]);
+      (phase === "free" && driver.reason
+        ? sentence(driver.reason)
+        : WORDS[phase === "over" ? "free" : phase]);
     const unheard = phase === "holding" && !who?.mine;
-    this.say(phase === "over" ? `${driver.reason}. Let go to begin again.` : unheard ? UNHEARD : free);
+    this.say(
+      phase === "over" ? `${sentence(driver.reason)} Let go to begin again.` : unheard ? UNHEARD : free,
+    );
     this.over.hidden = driver.other === "";
     if (!this.sure) this.over.textContent = `Take over from ${driver.other}`;
   }
@@ -264,6 +268,8 @@ export class DrivePanel {
     setText(this.said, capital(text));
   }
 }
+
+const sentence = (reason: string): string => (/[.…]$/.test(reason) ? reason : `${reason}.`);
 
 /** A figure with its limit, marked when it is beyond. */
 function figure(label: string): {
