@@ -366,6 +366,25 @@ def test_the_picture_outlives_a_lost_connection_to_the_broker(open_page, server,
     assert camera.viewers == (1, 0)
 
 
+def test_a_picture_that_the_browser_pauses_goes_on_beside_another_viewers(
+    open_page, server, car, broker, camera
+):
+    page, other = (open_car(open_page, f"{server.url}#/car/car-1", car) for _ in range(2))
+    for each in (page, other):
+        look(each)
+        sight(each, state="live", way="webrtc")
+    assert camera.viewers == (2, 0)
+    # As one that saves power does.
+    page.evaluate("document.querySelector('.sight video').pause()")
+    number = int(page.get_attribute(".sight", "data-frame") or 0)
+    until(lambda: int(page.get_attribute(".sight", "data-frame") or 0) > number + 5, "newer pictures")
+    assert page.get_attribute(".sight", "data-way") == "webrtc"
+    assert [look["kind"] for look in broker.sent("/video")].count("offer") == 2
+    other.get_by_role("button", name="Stop looking").click()
+    until(lambda: camera.viewers == (1, 0), "one to look on")
+    sight(page, state="live")
+
+
 LIGHT, DARK = {**DESKTOP, "color_scheme": "light"}, {**PHONE, "color_scheme": "dark"}
 
 
