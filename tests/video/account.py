@@ -16,11 +16,12 @@ from local.figures import Spread
 class Shown(NamedTuple):
     """A picture on a viewer's screen: when, by the machine's clock, and its number as the picture shows it;
     None if it cannot be read. ``held_ms`` is how long the viewer had its last packet by then, if that is
-    known."""
+    known, and ``early_ms`` how long before it the page was told of it."""
 
     shown_us: int
     number: int | None
     held_ms: float | None = None
+    early_ms: float = 0.0
 
 
 class Said(NamedTuple):
@@ -160,7 +161,7 @@ def judge(
     on_screen: dict[int, int] = {}
     for one in shown:
         if one.number is not None:
-            on_screen.setdefault(one.number, one.shown_us)
+            on_screen.setdefault(one.number, one.shown_us - round(one.early_ms * 1000))
     newest = sorted((at_us, number) for number, at_us in on_screen.items())
     own = [one for one in commands if span[0] <= one.at_us < span[1]]
     passed = [one for one in own if one.passed]

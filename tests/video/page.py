@@ -67,7 +67,7 @@ READER = """
       const received = about.receiveTime === undefined ? null : now - about.receiveTime;
       const at = Math.round((Date.now() + soon) * 1000);
       const read = number(video, video.videoWidth, video.videoHeight);
-      window.shownPictures.push([at, read, received === null ? null : received + soon]);
+      window.shownPictures.push([at, read, received === null ? null : received + soon, soon]);
       video.requestVideoFrameCallback(look);
     };
     video.requestVideoFrameCallback(look);

@@ -64,6 +64,8 @@ def test_a_refused_command_and_one_that_ends_are_not_wrong() -> None:
 
 def test_a_browser_tells_only_about_when_a_picture_is_on_the_screen() -> None:
     assert wrong(command(1_075_000, 10), screen_ms=5) == ()
+    early = [*SHOWN[:9], SHOWN[9]._replace(shown_us=1_200_000, early_ms=120)]
+    assert judge([command(1_085_000, 10)], early, CAPTURED, LIMIT_MS, EVER).wrong == ()
     # That makes no late picture younger.
     assert wrong(command(2_505_000, 20), screen_ms=50)
     assert wrong(command(2_505_000, 20, frame_age_ms=499.0), screen_ms=50)
