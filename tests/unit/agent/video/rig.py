@@ -189,9 +189,17 @@ class Loop:
         """End."""
         for peer in self.peers:
             self.do(peer.close())
+        self.do(self._end())
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
         self.loop.close()
+
+    async def _end(self) -> None:
+        """aiortc 1.9 leaves who waits for a picture waiting."""
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     def do(self, work: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine there, and return its result."""
