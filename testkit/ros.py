@@ -35,7 +35,7 @@ def python_with_rospy() -> str:
     if shutil.which("rosmaster") is None:
         raise RosError(f"ROS 1 is not installed: apt install {PACKAGES}")
     folder = ROOT / "build" / "ros-venv"
-    python, ready = folder / "bin" / "python", folder / "ready-with-mcap"
+    python, ready = folder / "bin" / "python", folder / "ready-with-video"
     folder.parent.mkdir(exist_ok=True)
     with folder.with_suffix(".lock").open("w") as lock:
         # Tests side by side make it once.
@@ -44,7 +44,18 @@ def python_with_rospy() -> str:
             shutil.rmtree(folder, ignore_errors=True)
             subprocess.run([SYSTEM_PYTHON, "-m", "venv", "--system-site-packages", folder], check=True)
             subprocess.run(
-                [python, "-m", "pip", "install", "-q", "awsiotsdk>=1.22,<2", "mcap>=1.6,<2"], check=True
+                [
+                    python,
+                    "-m",
+                    "pip",
+                    "install",
+                    "-q",
+                    "awsiotsdk>=1.22,<2",
+                    "mcap>=1.6,<2",
+                    "av>=12,<20",
+                    "pillow>=10.4",
+                ],
+                check=True,
             )
             ready.touch()
     return str(python)
