@@ -13,9 +13,9 @@ BLUE = (41, 240, 110)
 
 def start(graph: Any, script: str, *arguments: object) -> Process:
     """Run one of nodes/ of either ROS."""
-    return graph.start(
-        [graph.python, "-m", f"tests.ros.nodes.{script}", str(graph.ros), *map(str, arguments)]
-    )
+    module = f"tests.ros.nodes.{script}"
+    process: Process = graph.module(module, graph.ros, *arguments)
+    return process
 
 
 def camera_is_heard_while_somebody_looks(graph: Any) -> None:
