@@ -114,7 +114,8 @@ class Stops:
     def hold(self, now: float) -> None:
         """End the lease, and repeat the stop until `free`."""
         if not self.held:
-            self.held, self.ends = True, None
+            # Whoever moves it next has sent that after the stop.
+            self.held, self.ends, self.ended = True, None, now
             self._stops, self._next_stop = math.inf, now
 
     def put_off(self, until: float) -> None:

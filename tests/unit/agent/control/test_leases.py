@@ -352,7 +352,7 @@ class Model:
         assert event.session not in self.refused
         if self.moving_until is not None and self.now < self.moving_until:
             assert event.takeover or event.session == self.passed[-1].session
-        if self.passed and event.session == self.passed[-1].session:
+        if self.passed and event.session == self.passed[-1].session and not event.ends:
             assert self.now - (now_us + uncertainty_us - event.sent_us) / 1e6 >= self.stopped
         self.passed.append(event)
         rest_s = left_s(event, now_us + uncertainty_us)
@@ -389,8 +389,24 @@ SEEING = st.lists(
 _END = {"session": "0badcafe", "takeover": False, "ends": True, "ago_us": 0, "lease_ms": 31}
 
 
+_BLIND = {**_END, "ends": False, "lease_ms": 430, "behind": None, "blind": True}
+
+
 @given(SEEING)
 @example([0.5, 0.5, 0.5, {**_END, "behind": None, "blind": False}])
+# A motion that was sent before an emergency stop does not follow one that was sent after it.
+@example(
+    [
+        0.125,
+        _BLIND,
+        "hold",
+        "free",
+        {**_BLIND, "session": "1badcafe"},
+        {**_BLIND, "session": "1badcafe", "ago_us": 100_000},
+    ]
+)
+# An end that was sent before the robot stopped moves nothing.
+@example([_BLIND, 0.5, {**_END, "ago_us": 100_000, "lease_ms": 131, "behind": None, "blind": False}])
 def test_a_picture_that_freezes_ends_motion_within_its_limit_and_a_lease(events: list[Any]) -> None:
     happen(events, Model(SIGHTED))
 
