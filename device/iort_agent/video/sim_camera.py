@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Sequence
 
 from iort_agent.common.threads import Clock
 from iort_agent.errors import VideoError
@@ -106,10 +106,10 @@ class Hall:
         for i, (left, right) in enumerate(seen):
             next_left, next_right = seen[i + 1 - len(seen)]
             for side, (a, b) in enumerate(((left, next_left), (right, next_right))):
-                panel = _cut(a, b, near)
-                if panel is None:
+                panel = _before([a, b], near)
+                if not panel:
                     continue
-                (a0, a1), (b0, b1) = panel
+                (a0, a1), (b0, b1) = panel[:2]
                 # Both ends are to the same side of what the camera sees: a quarter of the circle.
                 if min(a0, b0) > far or (a1 > a0 and b1 > b0) or (-a1 > a0 and -b1 > b0):
                     continue
@@ -122,9 +122,8 @@ class Hall:
                     (ua, horizon + top / a0),
                 ]
                 walls.append((a0 + b0, quad, _WALLS + (2 * side + i % 2) * _SHADES + shade))
-            ends = [_cut(left, next_left, near), _cut(right, next_right, near)]
-            if ends[0] is not None and ends[1] is not None and ends[0][0][0] < far:
-                points = [*ends[0], *reversed(ends[1])]
+            points = _before([left, next_left, next_right, right], near)
+            if points and min(ahead for ahead, _ in points) < far:
                 colour = _START if i == 0 else _BAND if i % 2 else _OTHER
                 bands.append(
                     (
@@ -150,17 +149,16 @@ class Hall:
         pen.text((4, top - 15), text, fill=_WHITE, font=self._font)
 
 
-def _cut(
-    a: tuple[float, float], b: tuple[float, float], near: float
-) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """The part of a line from a to b, each (ahead, left), that is before the camera; None if none is."""
-    if a[0] < near and b[0] < near:
-        return None
-    if a[0] < near or b[0] < near:
-        share = (near - a[0]) / (b[0] - a[0])
-        end = near, a[1] + share * (b[1] - a[1])
-        return (end, b) if a[0] < near else (a, end)
-    return a, b
+def _before(corners: Sequence[tuple[float, float]], near: float) -> list[tuple[float, float]]:
+    """The part of a polygon, or of a line, that is before the camera; its points are (ahead, left)."""
+    points = []
+    for a, b in zip(corners, (*corners[1:], corners[0])):
+        if a[0] >= near:
+            points.append(a)
+        if (a[0] < near) != (b[0] < near):
+            share = (near - a[0]) / (b[0] - a[0])
+            points.append((near, a[1] + share * (b[1] - a[1])))
+    return points
 
 
 def _edges(track: Track, size_m: float) -> list[_Edge]:

@@ -60,6 +60,15 @@ def test_the_walls_are_where_they_belong() -> None:
     assert any(colours(turned, 0.75 + i / 200, 0.42)[1] > 150 for i in range(-20, 20)), "the other way around"
 
 
+@pytest.mark.parametrize("turned_rad", [-0.6, -0.3, 0.3, 0.6])
+def test_the_floor_reaches_the_camera_also_of_a_car_that_turns(turned_rad: float) -> None:
+    ground = packed(hall().draw(START._replace(x_m=1e6), 1, NOW_US))[640 * 240]
+    for place in range(0, len(CIRCUIT.x_m), 10):
+        along = pose(place)
+        picture = hall().draw(along._replace(heading_rad=along.heading_rad + turned_rad), 1, NOW_US)
+        assert all(colours(picture, i / 20, 0.86)[0] != ground for i in range(1, 20)), place
+
+
 def test_each_place_of_the_track_looks_its_own_way() -> None:
     one = hall(320, 240)
     seen = {packed(one.draw(pose(place), 1, NOW_US)) for place in range(0, CIRCUIT.steps, 3)}
