@@ -17,10 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from local.processes import Child
-from testkit.waiting import GUARD_S, InstrumentError
+from testkit.waiting import GUARD_S, InstrumentError, until
 
 ANY = -1
 TOOLS = ("ip", "nsenter", "unshare")
+_STAY = ("sleep", "infinity")
 _MADE = ("unshare", "--user", "--map-root-user", "--net", "--mount")
 # A process in a namespace makes a socket there and hands it over; it stays a socket of the namespace.
 _GIVER = """
@@ -96,21 +97,22 @@ def machines(folder: Path, *names: str) -> Iterator[list[Machine]]:
         raise NoNamespacesError(f"{missing[0]} is not installed: apt-get install iproute2 util-linux")
     if subprocess.run([*_MADE, "true"], capture_output=True, check=False).returncode:
         raise NoNamespacesError("this machine allows neither root nor users network namespaces of their own")
+    stay = b"".join(word.encode() + b"\0" for word in _STAY)
     with ExitStack() as stack:
 
         def stays(name: str, command: list[str]) -> Machine:
             child = Child(
                 name,
-                [*command, "sleep", "infinity"],
+                [*command, *_STAY],
                 environment=os.environ,
                 cwd=folder,
                 log=folder / f"{name}.log",
                 orphaned=signal.SIGKILL,
             )
             stack.callback(child.kill)
-            namespace = Path(f"/proc/{child.pid}/ns/net")
-            while namespace.readlink() == Path("/proc/self/ns/net").readlink():
-                child.check()
+            # It has its namespaces before they know its user: until then they allow us nothing.
+            until(lambda: child.poll() is not None or Path(f"/proc/{child.pid}/cmdline").read_bytes() == stay)
+            child.check()
             machine = Machine(child.pid)
             machine.run("ip", "link", "set", "lo", "up")
             return machine
