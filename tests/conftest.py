@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 from collections import Counter
 from collections.abc import Generator, Iterator
 from functools import lru_cache
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,6 +24,8 @@ settings.register_profile("iort", deadline=None, suppress_health_check=[HealthCh
 settings.load_profile("iort")
 # `make test-fast`; CI generates the usual number. tests/examples.py scales a test's own number with it.
 settings.register_profile("fast", settings.get_profile("iort"), max_examples=10, stateful_step_count=10)
+
+_SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
 
 # Tests that share something costly run in one worker of `make test`: an embedded cloud, the demo, which
 # starts its own cloud, the synthesized app. They start first, in this order: a long group that starts last
@@ -116,6 +120,32 @@ def services_read_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(botocore.session, "create_loader", lru_cache(botocore.session.create_loader))
         yield
+
+
+@pytest.fixture(autouse=True)
+def process_as_before() -> Iterator[None]:
+    """A test that leaves a logger silent or a variable set would change those after it in its process."""
+    before = _process()
+    yield
+    assert _process() == before, "the test, or the code that it ran, left its process changed"
+
+
+def _process() -> dict[str, object]:
+    """What all tests of a process share: logging, the environment, the working folder, the signals."""
+    manager = logging.Logger.manager
+    loggers = {
+        name: (log.level, log.propagate, log.disabled)
+        for name, log in list(manager.loggerDict.items())
+        if name.startswith(("iort", "foxglove")) and isinstance(log, logging.Logger)
+    }
+    return {
+        "logging": (logging.getLogger().level, manager.disable),
+        # A logger is as good as none until it is set.
+        "loggers": {name: state for name, state in loggers.items() if state != (logging.NOTSET, True, False)},
+        "environment": {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"},
+        "folder": Path.cwd(),
+        "signals": {number: signal.getsignal(number) for number in _SIGNALS},
+    }
 
 
 # What no registry has, or only with 8 GB of packages: the reason of a test that is skipped without it.

@@ -88,7 +88,9 @@ class Channels:
 
     def __enter__(self) -> Self:
         # A client's mistake is told to the client, and must not fill the terminal.
-        logging.getLogger("foxglove").setLevel(logging.CRITICAL)
+        log = logging.getLogger("foxglove")
+        self._level = log.level
+        log.setLevel(logging.CRITICAL)
         capabilities = [Capability.ClientPublish] if self._publishes else []
         if self._range_ns is not None:
             capabilities += [Capability.PlaybackControl, Capability.Time]
@@ -115,6 +117,7 @@ class Channels:
 
     def __exit__(self, *_error: object) -> None:
         self._server.stop()
+        logging.getLogger("foxglove").setLevel(self._level)
 
     def add(self, topic: Topic) -> int:
         """Advertise a topic, also while clients are connected; returns its number."""

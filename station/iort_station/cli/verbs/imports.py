@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -82,8 +84,7 @@ def import_(
     from iort_station.imports.choice import Choice, configured  # noqa: PLC0415 - as above
     from iort_station.imports.run import run  # noqa: PLC0415 - as above
 
-    # The outcome says what the reader would log.
-    logging.getLogger("iort_contract.recordings").setLevel(logging.CRITICAL)
+    context.with_resource(_silent_reader())
     cloud = context.obj.cloud()
     registry.get(cloud, robot)
     choice = Choice(only=tuple(topics or ()), upload=large == "upload")
@@ -144,6 +145,18 @@ def import_(
         for outcome in outcomes:
             _show_outcome(robot, outcome)
     raise typer.Exit(1 if any(one.refused for one in plans) else 0)
+
+
+@contextmanager
+def _silent_reader() -> Iterator[None]:
+    """The outcome says what the reader of recordings would log."""
+    log = logging.getLogger("iort_contract.recordings")
+    before = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 def _show_plan(plan: Plan) -> None:
