@@ -7,7 +7,6 @@ whole ROS messages has their own topics beside it, byte for byte, with their ori
 from __future__ import annotations
 
 import heapq
-import struct
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -19,9 +18,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.records import Channel, Schema
 
 from iort_analysis.samples.batches import RefusedItems
@@ -34,6 +30,7 @@ from iort_station.bridge.channels import Message, Topic
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, ros_messages
 from iort_station.data.export import Export
+from iort_station.data.mcap_files import McapIndex
 from iort_station.data.queries import samples
 from iort_station.data.recorded import Recorded, Selection
 from iort_station.data.ros_forms import ConversionError, Form, form_of, from_ros2
@@ -47,10 +44,6 @@ _BY_TIME = attrgetter("t_ns")
 # A range is read in parts, which grow: an hour of the archive is read as one, and may have gigabytes, and the
 # first message must not wait for the last one.
 _FIRST_US, _GROWS, _MOST_US = 10_000_000, 4, 160_000_000
-# What the library raises for a file that is no MCAP, or that was damaged; a RuntimeError is lz4's.
-_UNREADABLE = (OSError, McapError, EOFError, ValueError, struct.error, zstandard.ZstdError, RuntimeError)
-# A chunk is unpacked in memory: 30 KB may become gigabytes.
-MOST_CHUNK_BYTES = 256 * 1024 * 1024
 
 
 class Cancelled(Exception):  # noqa: N818 - no fault
@@ -258,46 +251,23 @@ class McapFile(Source):
     """An MCAP file, also a robot's incident. Raises `StationError` if it cannot be read."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self.topics = path, []
-        try:
-            with path.open("rb") as file:
-                summary = make_reader(file).get_summary()
-        except _UNREADABLE as error:
-            raise StationError(f"{path} must be an MCAP file: {error}") from error
-        if summary is None or summary.statistics is None or not summary.statistics.message_count:
-            what = "has no messages" if summary is not None and summary.statistics else "has no index"
-            raise StationError(f"{path} {what}: `mcap recover` of the program mcap mends a file that was cut")
-        self.start_ns = summary.statistics.message_start_time
-        self.end_ns = summary.statistics.message_end_time + 1
+        self._index, self.topics = McapIndex(path), []
+        self.start_ns, self.end_ns = self._index.start_ns, self._index.end_ns
         self._numbers: dict[int, int] = {}
-        for channel in summary.channels.values():
-            topic = _topic_of(channel, summary.schemas.get(channel.schema_id))
+        for channel in self._index.channels.values():
+            topic = _topic_of(channel, self._index.schemas.get(channel.schema_id))
             if topic not in self.topics:
                 self.topics.append(topic)
             self._numbers[channel.id] = self.topics.index(topic)
-        chunk_bytes = max((index.uncompressed_size for index in summary.chunk_indexes), default=1)
-        if chunk_bytes > MOST_CHUNK_BYTES:
-            size = f"{chunk_bytes // 2**20:,} MB, at most {MOST_CHUNK_BYTES // 2**20} MB are read"
-            raise StationError(
-                f"{path} has a chunk of {size}: `mcap filter` of the program mcap writes smaller ones"
-            )
-        self.largest_bytes = chunk_bytes // 16
+        self.largest_bytes = self._index.chunk_bytes // 16
 
     def messages(
         self, start_ns: int, wanted: frozenset[int], _check: Callable[[], None], _say: Callable[[str], None]
     ) -> Generator[Message, None, None]:
-        topics = {self.topics[number].name for number in wanted}
-        try:
-            with self._path.open("rb") as file:
-                reader = make_reader(file)
-                for _, channel, message in reader.iter_messages(
-                    topics, starting_at=start_ns, ending_before=self.end_ns
-                ):
-                    number = self._numbers[channel.id]
-                    if number in wanted:
-                        yield Message(message.log_time, number, message.data)
-        except _UNREADABLE as error:
-            raise StationError(f"{self._path} cannot be read any further: {error}") from error
+        channels = {channel for channel, number in self._numbers.items() if number in wanted}
+        with closing(self._index.messages(channels, start_ns, self.end_ns)) as messages:
+            for one in messages:
+                yield Message(one.log_ns, self._numbers[one.channel], one.data)
 
 
 def _topic_of(channel: Channel, schema: Schema | None) -> Topic:

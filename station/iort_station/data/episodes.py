@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from iort_analysis.samples.blocks import Block, Column, column_of, join, ordered
@@ -31,6 +29,7 @@ from iort_station.data import inventory, ros_messages
 from iort_station.data.conditions import derive
 from iort_station.data.export import Export
 from iort_station.data.images import Images, Pixels
+from iort_station.data.mcap_files import McapIndex
 from iort_station.data.queries import samples
 from iort_station.data.recorded import Selection
 from iort_station.errors import StationError, UsageError, unknown
@@ -149,19 +148,16 @@ class Kept:
     def __init__(self, path: Path, vehicle: Vehicle | None, about: Mapping[str, Any]) -> None:
         self.about = about
         self._path, self._vehicle = path, vehicle
-        with path.open("rb") as file:
-            try:
-                summary = make_reader(file).get_summary()
-            except (McapError, OSError, ValueError) as error:
-                raise StationError(f"{path.name} is no incident: {error}") from error
-        if summary is None or summary.statistics is None:
-            raise StationError(f"{path.name} is no incident: it has no index")
+        try:
+            self._index = McapIndex(path)
+        except StationError as error:
+            raise StationError(f"{path.name} is no incident: {error}") from error
         self._topics = {
             channel.metadata.get(CHANNEL_STREAM, channel.topic): channel.topic
-            for channel in summary.channels.values()
+            for channel in self._index.channels.values()
         }
-        self.start_us = summary.statistics.message_start_time // 1000
-        self.end_us = summary.statistics.message_end_time // 1000 + 1
+        self.start_us = self._index.start_ns // 1000
+        self.end_us = (self._index.end_ns - 1) // 1000 + 1
 
     def samples(self, stream: str, names: Sequence[str]) -> Block:
         times: list[int] = []
@@ -193,12 +189,15 @@ class Kept:
             raise unknown(
                 f"{self._path.name} has no stream {stream}", [stream], self._topics, "mcap info FILE"
             )
-        with self._path.open("rb") as file:
-            try:
-                for schema, channel, message in make_reader(file).iter_messages([topic]):
-                    yield message.publish_time // 1000, schema, channel, message.data
-            except (McapError, OSError, ValueError) as error:
-                raise StationError(f"{self._path.name} is damaged: {error}") from error
+        channels = {number: one for number, one in self._index.channels.items() if one.topic == topic}
+        for message in self._index.messages(channels):
+            channel = channels[message.channel]
+            yield (
+                message.publish_ns // 1000,
+                self._index.schemas.get(channel.schema_id),
+                channel,
+                message.data,
+            )
 
 
 def _sample(schema: Any, channel: Any, data: bytes) -> Mapping[str, Value]:

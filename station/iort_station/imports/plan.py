@@ -13,21 +13,20 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from mcap.reader import make_reader
-
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.dynamodb import starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import batch_id
 from iort_contract.recordings import RecordingError
-from iort_contract.recordings.files import INDEX, Reader, wrapped
+from iort_contract.recordings.files import INDEX, Reader
 from iort_contract.recordings.rosbag import Recording, Unread
 from iort_contract.recordings.scan import Scan
 from iort_contract.recordings.tool_csv import VescLog
 from iort_contract.tables import BATCH
 from iort_station.cloud import Cloud
+from iort_station.data.mcap_files import metadata
 from iort_station.data.recorded import Recorded
-from iort_station.errors import UsageError
+from iort_station.errors import StationError, UsageError
 from iort_station.imports.batches import FIRST_US
 from iort_station.imports.choice import Choice, TopicChoice
 from iort_station.imports.ledger import Import, Ledger, content_of
@@ -334,8 +333,8 @@ def said_robot(path: Path) -> str:
     if path.suffix != ".mcap":
         return ""
     # A file without an index, or with a damaged one, says nothing.
-    with suppress(RecordingError), wrapped(str(path)), path.open("rb") as file:
-        for one in make_reader(file).iter_metadata():
+    with suppress(StationError):
+        for one in metadata(path):
             if robot := _robot_of(one.metadata):
                 return robot
     return ""
