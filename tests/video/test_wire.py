@@ -15,6 +15,7 @@ from testkit.waiting import GUARD_S, until
 from testkit.wire import Conditions, Way, Wire
 
 MANY = 10_000
+_FIRST, _LAST = 2**32 - 2, 2**32 - 1
 
 
 def way(**conditions: float) -> Way:
@@ -71,6 +72,13 @@ class Ends:
         self.sender = wire.one.socket(socket.SOCK_DGRAM, bind=(wire.one.address, port))
         self.receiver = wire.other.socket(socket.SOCK_DGRAM, bind=(wire.other.address, port))
 
+    def known(self) -> None:
+        """Wait until they know each other: who has an address is asked first."""
+        until(lambda: self.send(_FIRST) or self.next(1.0) is not None, "the first frame")
+        # After a while without an answer it was sent again, and comes late.
+        self.send(_LAST)
+        until(lambda: self.next(GUARD_S) == _LAST, "the last of them")
+
     def send(self, number: int) -> None:
         self.sender.sendto(number.to_bytes(4, "big") + bytes(996), self.to)
 
@@ -84,7 +92,7 @@ class Ends:
 def ends(wire: Wire, request: pytest.FixtureRequest) -> Iterator[Ends]:
     wire.set(delay_ms=0.0, loss=0.0, kbit_s=0.0, cut=False)
     made = Ends(wire, 5000 + len(request.node.name))
-    until(lambda: made.send(0) or made.next(1.0) is not None)  # who has this address is asked first
+    made.known()
     yield made
     made.sender.close()
     made.receiver.close()

@@ -264,10 +264,14 @@ def test_others_open_the_incident_of_a_running_agent(running: Callable[..., Agen
     if sys.version_info >= (3, 10):  # the rosbags for older ones opens no single file
         with highlevel.AnyReader([path]) as bag:
             assert [data for _, _, data in bag.messages()] == whole
-    report = make_status(agent)
-    assert report.recorder is not None
-    assert report.recorder["waiting"] == 1
-    assert "recorder  " in render(report)
+
+    def waiting() -> int:
+        report = make_status(agent).recorder
+        return report["waiting"] if report is not None else 0
+
+    # The file is there before the plan says so.
+    until(lambda: waiting() == 1, "the file to wait for its upload")
+    assert "recorder  " in render(make_status(agent))
 
 
 def test_a_window_begins_in_the_run_before(running: Callable[..., Agent], tmp_path: Path) -> None:
@@ -349,4 +353,6 @@ def test_kill_9_in_the_window_costs_less_than_a_second_of_it(tmp_path: Path) -> 
     lost = sorted({*window} - {*found})
     # The chunk that was open when the process was killed.
     assert all(kill_us - S < t_us <= kill_us for t_us in lost)
-    assert min(window) == min(found) < kill_us
+    # What came in it may be a little older.
+    assert min(window) < kill_us
+    assert min(window) in found

@@ -46,13 +46,15 @@ from iort_contract.messages.video import (
 )
 from iort_contract.ros.decode import Decoder, stamp_ns
 from iort_contract.ros.definition import parse
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 from tests.unit.agent.test_agent import Rig as AgentRig
-from tests.unit.agent.video.rig import CONFIG, HEIGHT, WIDTH, Looks, Viewer, drawn
+from tests.unit.agent.video.rig import CONFIG, HEIGHT, WIDTH, Looks, Viewer, drawn, instant
 
 
 def test_a_viewer_sees_the_pictures_and_knows_each_ones_number(rig, loop):
     viewer = Viewer(rig, loop).connect()
+    # The channel may open after the first picture.
+    until(lambda: viewer.marks, "the first marks")
     seen = viewer.sees(20)
     numbers = [one.number for one in seen]
     assert None not in numbers
@@ -64,13 +66,13 @@ def test_a_viewer_sees_the_pictures_and_knows_each_ones_number(rig, loop):
     assert len(known) >= 18
     assert {marks[one.number].rtp - one.rtp for one in known} == {origin}
     captured = {mark.number: mark.captured_us for mark in marks.values()}
-    now_us, now = rig.clock.now_us(), rig.clock.monotonic()
+    now_us, now = instant(rig.clock)
     newest = known[-1].number
-    assert rig.pictures.age_ms(newest, now) == pytest.approx((now_us - captured[newest]) / 1000, abs=5)
+    # A session reads its two clocks one after the other.
+    assert rig.pictures.age_ms(newest, now) == pytest.approx((now_us - captured[newest]) / 1000, abs=200)
     viewer.ask_clock(7)
     (answer,) = until(lambda: viewer.clocks, "the robot's clock")
-    assert answer[0] == 7
-    assert now_us <= answer[1] <= rig.clock.now_us()
+    assert answer == (7, pytest.approx(now_us, abs=GUARD_S * 1e6))
     viewer.close()
 
 
@@ -124,14 +126,17 @@ print([name for name in ("aiortc", "av", "PIL") if name in sys.modules])
     assert output.stdout.strip() == "[]"
 
 
+def numbers_of(viewer):
+    return {one.number for one in list(viewer.seen)}
+
+
 def test_each_viewer_begins_with_a_key_picture_and_all_share_one_encoder(rig, loop):
     first = Viewer(rig, loop).connect()
     first.sees(5)
     second = Viewer(rig, loop).connect()
     second.sees(5)
-    assert None not in [one.number for one in first.seen + second.seen]
-    both = {one.number for one in first.seen} & {one.number for one in second.seen}
-    assert len(both) >= 4
+    until(lambda: len(numbers_of(first) & numbers_of(second)) >= 4, "pictures that both see")
+    assert None not in numbers_of(first) | numbers_of(second)
     samples = [values for _, values in rig.samples]
     assert len({values["frame"] for values in samples}) == len(samples)
     assert {values["viewers"] for values in samples} == {1, 2}
@@ -184,8 +189,13 @@ def test_viewers_who_leave_while_they_connect_leave_nothing(rig, loop):
     # Whoever is answered now came after them.
     assert rig.ask(rig.name(), ASK).kind == TERMS
     until(lambda: not signalling._closing, "the sessions' end")
-    names = [task.get_coro().__qualname__ for task in asyncio.all_tasks(signalling._loop)]
-    assert "Connection.query_consent" not in names
+
+    def checks():
+        tasks = asyncio.all_tasks(signalling._loop)
+        return [task for task in tasks if task.get_coro().__qualname__ == "Connection.query_consent"]
+
+    # Those that were cancelled last end with the loop's next turn.
+    until(lambda: not checks(), "the end of the connections' checks")
 
 
 def end_of(rig, viewer):
@@ -299,7 +309,8 @@ def test_without_webrtc_all_watchers_share_small_pictures_over_the_broker(make_r
     assert "encoder" not in rig.video.report()
 
 
-def test_a_camera_that_fails_is_told_to_viewers_and_to_those_who_come(rig, loop):
+def test_a_camera_that_fails_is_told_to_viewers_and_to_those_who_come(rig, loop, monkeypatch):
+    monkeypatch.setattr(module, "AGAIN_S", GUARD_S)
     viewer = Viewer(rig, loop).connect()
     viewer.sees()
     rig.camera.error = VideoError("/dev/video0: unplugged")
