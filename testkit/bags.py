@@ -24,8 +24,6 @@ START_NS = 1_600_000_000_000_000_000
 # What a second of the recording takes, about.
 BYTES_A_SECOND = 480_000
 BEAMS = 1081
-# The kinds of recordings: a .bag, folders of ROS 2, and an .mcap of ROS 1's messages.
-KINDS = ("bag", "mcap", "db3", "mcap of ROS 1")
 _WHOLE = {"displacement", "distance_traveled", "fault_code", "controller_id"}
 
 
@@ -138,7 +136,7 @@ STREAMS = {"/sensors/core": "vesc", "/odom": "odom", "/imu/data": "imu-data", "/
 
 
 def written(path: Path, kind: str, *, seconds: float, start_ns: int = START_NS) -> int:
-    """Write a recording of one of `KINDS`; returns the number of its messages."""
+    """Write a ``bag``, ``mcap``, ``db3`` or ``mcap of ROS 1``; returns the number of its messages."""
     ros1 = kind in ("bag", "mcap of ROS 1")
     store = _store(ros1=ros1)
     serialize = store.serialize_ros1 if ros1 else store.serialize_cdr

@@ -273,7 +273,7 @@ class Environment:
 
 
 @contextlib.contextmanager
-def started(function: Function, folder: Path, *, python: str = sys.executable) -> Iterator[Environment]:
+def started(function: Function, folder: Path) -> Iterator[Environment]:
     """Run the function in an environment of its own while the block lasts; its files are in ``folder``.
 
     Raises `RuntimeFailedError` if it does not start.
@@ -285,7 +285,7 @@ def started(function: Function, folder: Path, *, python: str = sys.executable) -
     with served(api, services) as address, printed.open("wb") as out, logged.open("wb") as log:
         process = subprocess.Popen(
             # -S and -s: only the linked packages of this environment are on the path.
-            [python, "-S", "-s", "-m", "awslambdaric", function.handler],
+            [sys.executable, "-S", "-s", "-m", "awslambdaric", function.handler],
             cwd=function.code,
             env=_variables(function, address, own, log.fileno()),
             stdin=subprocess.DEVNULL,

@@ -16,7 +16,7 @@ import secrets
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -49,8 +49,6 @@ _STYLES = {
     Verdict.NOT_ASKED: "yellow",
     Verdict.FAILED: "red",
 }
-
-Say = Callable[[str], None]
 
 
 def main() -> None:

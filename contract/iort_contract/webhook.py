@@ -21,8 +21,6 @@ from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 from iort_contract.topics import check_namespace
 
 TIMESTAMP, SIGNATURE, DELIVERY = "Iort-Timestamp", "Iort-Signature", "Iort-Delivery"
-# A receiver refuses a message whose timestamp differs by more from its own clock: somebody repeats it.
-TOLERANCE_S = 300
 # In an event for the function incident: send one test message, and answer with its status.
 TEST = "test"
 _MAX_URL = 1000

@@ -30,7 +30,6 @@ from tests.unit.station.data.test_queries import START, cloud_of
 START_NS = START * 1000
 HOUR_S, HZ = 3600, 10
 MADE = MessageType("made", "/lab/made", "lab_msgs/msg/Made", "", "float64 x\nuint8 n\n")
-SCAN = "scan"
 
 
 def put(cloud: Any, stream: str, *batches: Batch) -> None:

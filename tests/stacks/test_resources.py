@@ -115,9 +115,6 @@ def test_what_nobody_waits_for_leaves_executions_to_what_robots_and_people_wait_
     assert reserved == []
 
 
-BACKGROUND = {"Plan", "Analyse", "Evaluate", "Present", "Archive"}
-
-
 def test_a_message_of_a_queue_is_not_read_twice_at_once(synthesized):
     """AWS advises six times the timeout of the queue's reader."""
     functions = synthesized.resources("AWS::Lambda::Function")

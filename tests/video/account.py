@@ -10,7 +10,6 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from iort_agent.control.commands import ACCEPTED
-from local.figures import Spread
 
 
 class Shown(NamedTuple):
@@ -186,9 +185,3 @@ def judge(
             wrong.append(f"command {one.seq}: {', '.join(why)}")
     last_ms = (passed[-1].at_us - span[0]) / 1000 if passed else None
     return Verdict(len(passed), len(own) - len(passed), last_ms, tuple(wrong))
-
-
-def spread(values: Sequence[float]) -> str:
-    """Median and 95th percentile as text."""
-    found = Spread.of(values)
-    return f"{found.text(0)}, {found.n}"

@@ -6,7 +6,6 @@ with the fleet's template. The operator makes claims with `iort robots claim`.
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import time
@@ -25,8 +24,6 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.commands import DOWNLINK_NOTE, VIDEO_NOTE, stick_downlink
 from iort_contract.topics import check_robot
-
-_log = logging.getLogger(__name__)
 
 _SWITCH_S = 60.0
 _LOOK_S = 0.5

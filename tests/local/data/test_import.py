@@ -50,7 +50,6 @@ from tests.recordings import recording
 
 SECONDS = 4.0
 COUNTS = {STREAMS[topic.name]: int(SECONDS * topic.hz) for topic in TOPICS}
-ALL = sum(COUNTS.values())
 Iort = Callable[..., Any]
 DAY_NS = 86_400_000_000_000
 

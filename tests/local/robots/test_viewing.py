@@ -11,8 +11,6 @@ from iort_station.page.server import PageServer
 from testkit.waiting import until
 from tests.local.data.drives import Agent
 
-_FULL_MS, _IDLE_MS = 100, 10_000
-
 
 def test_a_page_wakes_its_car_and_one_that_is_cut_off_lets_it_sleep(embedded, bundle, open_page):
     car = bundle(sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50, "pose": {"rate_hz": 0}}])

@@ -125,10 +125,10 @@ def test_around_a_circle_the_grip_gives_the_speed() -> None:
     assert found.lap_s == pytest.approx(2 * math.pi * 5 / math.sqrt(GRIP * 5), rel=1e-3)
 
 
-def stadium(straight_m: float, radius_m: float, step_m: float = 0.05) -> NDArray[np.float64]:
+def stadium(straight_m: float, radius_m: float) -> NDArray[np.float64]:
     """Two straights and two half circles, from the start of the first straight on."""
-    along = np.arange(0, straight_m, step_m)
-    angle = np.arange(0, np.pi, step_m / radius_m)
+    along = np.arange(0, straight_m, 0.05)
+    angle = np.arange(0, np.pi, 0.05 / radius_m)
     ahead = np.column_stack([along, np.zeros(along.size)])
     turn = np.column_stack([straight_m + radius_m * np.sin(angle), radius_m * (1 - np.cos(angle))])
     back = np.array([straight_m, 2 * radius_m]) - np.vstack([ahead, turn])

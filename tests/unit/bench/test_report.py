@@ -181,8 +181,8 @@ def test_a_merged_report_keeps_what_was_not_measured_again(tmp_path):
     assert writer.read(tmp_path, kind) == ([first, second], now)
 
 
-def _declared(*options, section=None):
-    return Declared("", lambda *_, **__: section or _section(), options, cloud=False)
+def _declared(*options):
+    return Declared("", lambda *_, **__: _section(), options, cloud=False)
 
 
 def test_options_are_read_by_the_section_that_has_them():

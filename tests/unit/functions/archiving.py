@@ -84,8 +84,8 @@ class Cloud:
                 self.sqs.delete_message(QueueUrl=url, ReceiptHandle=message["ReceiptHandle"])
         return found
 
-    def expiries(self, hour=HOUR_0):
-        keys = starting_between(hour.start_us, hour.end_us - 1)
+    def expiries(self):
+        keys = starting_between(HOUR_0.start_us, HOUR_0.end_us - 1)
         pages = self.archive.telemetry.pages(TOPIC_OF_CAR, keys)
         return [int(item[EXPIRES_S]["N"]) for page in pages for item in page.items]
 

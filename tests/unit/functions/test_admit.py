@@ -268,12 +268,12 @@ def iot(monkeypatch):
     return made
 
 
-def spent(robots, certificate, *, ago_ms=admit.SETTLED_MS, **row):
+def spent(robots, certificate, **row):
     """A name to which a certificate was admitted some time ago."""
     robots.clear()
     robots.put(**{SERIAL: "s1", ADMIT_CLAIM: "claim", ADMIT_FINGERPRINT: "digits", **row})
     assert robots.ask(request(certificate=certificate, claim=row.get(ADMIT_CLAIM, "claim"))) is True
-    robots.change(ADMITTED_MS, time.time_ns() // 1_000_000 - ago_ms)
+    robots.change(ADMITTED_MS, time.time_ns() // 1_000_000 - admit.SETTLED_MS)
 
 
 def test_an_admitted_certificate_that_never_registered_gives_way_to_another(robots, iot):

@@ -77,9 +77,9 @@ def image(n):
     return {"topic": {"S": TOPIC_OF_CAR}, "batch": {"S": f"{n:016}-0badcafe-0"}, "v": {"N": "9"}}
 
 
-def failed_batch(condition="RetryAttemptsExhausted"):
+def failed_batch():
     """As "Using Lambda with DynamoDB" shows an on-failure record."""
-    return json.dumps({"requestContext": {"condition": condition}, "DDBStreamBatchInfo": INFO})
+    return json.dumps({"requestContext": {"condition": "RetryAttemptsExhausted"}, "DDBStreamBatchInfo": INFO})
 
 
 def invocation(event, error="boom"):

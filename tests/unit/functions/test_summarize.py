@@ -191,12 +191,12 @@ def test_removals_are_skipped(stream, capsys):
     assert counted(capsys) == {}
 
 
-def interleaved(seconds, behind_s=2):
-    """Two publishers of one stream; the clock of one is behind: batches in the order in which
+def interleaved(seconds):
+    """Two publishers of one stream; the clock of one is 2 s behind: batches in the order in which
     the agent closes and numbers them."""
     batches = []
     for i in range(seconds):
-        for start_s in (i, i - behind_s):
+        for start_s in (i, i - 2):
             batches.append(batch(T0 + start_s * S + 100, 10, step_us=1000, seq=len(batches)))
     return batches
 

@@ -57,8 +57,8 @@ class Run:
         self.shard.put(record(n) for n in range(count))
         self.given, self.seen = given, []
 
-    def all(self, now_s=0.0, limit=200):
-        for _ in range(limit):
+    def all(self, now_s=0.0):
+        for _ in range(200):
             for lane in self.shard.lanes:
                 if batch := lane.batch(now_s):
                     self.seen.append(numbers(batch))

@@ -55,9 +55,9 @@ class Desk:
         self.passed.append((stream, t_us, values))
         return 7.0
 
-    def imu(self, first: int, count: int, size: int = 8, kind: RosType = IMU) -> None:
+    def imu(self, first: int, count: int, size: int = 8) -> None:
         for i in range(first, first + count):
-            self.emit("imu", T0 + i, RosMessage(body(i, size), kind))
+            self.emit("imu", T0 + i, RosMessage(body(i, size), IMU))
 
     def pass_s(self, seconds: float) -> None:
         """Let time pass as the thread would."""

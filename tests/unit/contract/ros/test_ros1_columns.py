@@ -72,13 +72,13 @@ def again(batch: Batch, layouts: Any = None) -> list[bytes]:
     return list(messages.raw)
 
 
-def flat(x: float = 1.5, y: float = 0.5, n: int = 3, on: int = 1, big: int = 2**63) -> bytes:
-    return struct.pack("<dfhBQ", x, y, n, on, big)
+def flat(x: float = 1.5, y: float = 0.5, n: int = 3, on: int = 1) -> bytes:
+    return struct.pack("<dfhBQ", x, y, n, on, 2**63)
 
 
-def stamped(i: int, *, ns: int = 250, seq: int = 7, frame: str = "base_link", off_us: int = 0) -> bytes:
+def stamped(i: int, *, ns: int = 250, frame: str = "base_link", off_us: int = 0) -> bytes:
     sec, us = divmod(T0 + i * 1000 + off_us, 1_000_000)
-    return header_of(seq + i, sec, us * 1000 + ns, frame) + struct.pack("<dB", i / 4, i % 256)
+    return header_of(7 + i, sec, us * 1000 + ns, frame) + struct.pack("<dB", i / 4, i % 256)
 
 
 def header_of(seq: int, sec: int, nanosec: int, frame: str) -> bytes:

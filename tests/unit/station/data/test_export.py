@@ -234,9 +234,9 @@ def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
             return [bytes(raw) for _, _, raw in reader.messages()]
 
 
-def of_some_definition(most: int = 4) -> st.SearchStrategy[tuple[Message, list[bytes]]]:
+def of_some_definition() -> st.SearchStrategy[tuple[Message, list[bytes]]]:
     return definitions().flatmap(
-        lambda made: st.tuples(st.just(made), st.lists(messages(made), min_size=1, max_size=most))
+        lambda made: st.tuples(st.just(made), st.lists(messages(made), min_size=1, max_size=4))
     )
 
 

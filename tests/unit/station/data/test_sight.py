@@ -213,7 +213,7 @@ STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_JAZ
 COMPRESSED, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 
 
-def image_file(ros: int, kind: str, pictures: dict[int, bytes], topic: str = "/iort/video") -> bytes:
+def image_file(ros: int, kind: str, pictures: dict[int, bytes]) -> bytes:
     """An incident's file with pictures, by their capture times."""
     store, out = STORES[ros], io.BytesIO()
     types, writer = store.types, Writer(out)
@@ -221,7 +221,7 @@ def image_file(ros: int, kind: str, pictures: dict[int, bytes], topic: str = "/i
     named = kind if ros == 2 else kind.replace("/msg", "")
     text = store.generate_msgdef(kind, ros_version=ros)[0].encode()
     schema = writer.register_schema(named, f"ros{ros}msg", text)
-    channel = writer.register_channel(topic, "cdr" if ros == 2 else "ros1", schema)
+    channel = writer.register_channel("/iort/video", "cdr" if ros == 2 else "ros1", schema)
     other = writer.register_channel("vesc", "json", writer.register_schema("vesc", "jsonschema", b"{}"))
     for i, (t_us, data) in enumerate(pictures.items()):
         stamp = types["builtin_interfaces/msg/Time"](sec=t_us // S, nanosec=t_us % S * 1000)
