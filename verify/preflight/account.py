@@ -33,6 +33,8 @@ QUOTAS = {
     "Rule evaluations per second per AWS account": "IoT Core: rule evaluations",
 }
 CONNECTS_QUOTA = "Connect requests per second per account"
+# CloudFormation knows it where Kinesis Video Streams is.
+TURN_TYPE = "AWS::KinesisVideo::SignalingChannel"
 
 
 @item("credentials")
@@ -196,4 +198,19 @@ def policy_versions(clients: Clients, settings: Settings) -> Finding:
     )
 
 
-ITEMS = (bootstrap, iot_log, audit, concurrency, quotas, spending, policy_versions)
+@item("relays for video")
+def relays(clients: Clients, settings: Settings) -> Finding:
+    """Check that the region has Kinesis Video Streams if `turn` needs it."""
+    if not settings.turn:
+        return fine("not wanted (turn=false)")
+    ask = clients.client("cloudformation").describe_type
+    if known("TypeNotFoundException", ask, Type="RESOURCE", TypeName=TURN_TYPE) is None:
+        return stops(
+            f"this region has no Kinesis Video Streams: CloudFormation does not know {TURN_TYPE}",
+            "deploy without -c turn=true, and give car.yaml a server of your own (`video.turn`), or choose "
+            "another region",
+        )
+    return fine("this region has Kinesis Video Streams; turn=true")
+
+
+ITEMS = (bootstrap, iot_log, audit, concurrency, quotas, spending, policy_versions, relays)

@@ -68,6 +68,7 @@ NEW = {
     "ListServiceQuotas": {"Quotas": []},
     "ListAWSDefaultServiceQuotas": {"Quotas": QUOTAS},
     "ListTopicRules": {"rules": []},
+    "DescribeType": {"TypeName": "AWS::KinesisVideo::SignalingChannel", "Visibility": "PUBLIC"},
     "DescribeStacks": no_stack,
     "ListStackResources": no_stack,
     "DescribeThingType": absent,

@@ -44,13 +44,19 @@ def test_an_error_of_the_client_stops_the_preflight(error):
     assert str(error) in finding.found
 
 
-EVERYTHING = {"site": True, "device_defender": True, "iot_log_level": "error", "stage": "prod"}
+EVERYTHING = {
+    "site": True,
+    "device_defender": True,
+    "iot_log_level": "error",
+    "stage": "prod",
+    "turn": True,
+}
 
 
 def test_a_new_account_passes_and_is_only_read():
     account = Account()
     findings = preflight.look(account, settings(**EVERYTHING))
-    assert len({finding.item for finding in findings}) == len(findings) == 12
+    assert len({finding.item for finding in findings}) == len(findings) == 13
     assert not preflight.stopped(findings)
     assert all(name.startswith(("Get", "List", "Describe")) for name in account.asked)
 
@@ -58,7 +64,7 @@ def test_a_new_account_passes_and_is_only_read():
 def test_a_missing_permission_is_a_warning_that_names_it():
     answers = {name: denied(f"service:{name}") for name in NEW if name != "GetCallerIdentity"}
     _, *findings = preflight.look(Account(**answers), settings(**EVERYTHING))
-    assert len(findings) == 11
+    assert len(findings) == 12
     for finding in findings:
         if finding.item == "spending":
             continue

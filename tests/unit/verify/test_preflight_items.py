@@ -55,6 +55,8 @@ STUCK = (
     *("UPDATE_ROLLBACK_FAILED", "UPDATE_IN_PROGRESS"),
 )
 
+NO_VIDEO = {"DescribeType": Refused("TypeNotFoundException", "The type does not exist.", 404)}
+
 
 CASES = [
     ("spending", {}, {}, WARNING, "alarm_email: nobody hears of an alarm; budget_usd: nobody hears"),
@@ -125,6 +127,15 @@ CASES = [
         "992 rules of others and 10 of ours exceed the limit 1000",
     ),
     ("quotas", {}, rules("iort_live", "iort_record"), FINE, "robots"),
+    ("relays", {}, NO_VIDEO, FINE, "not wanted (turn=false)"),
+    ("relays", {"turn": True}, {}, FINE, "this region has Kinesis Video Streams"),
+    (
+        "relays",
+        {"turn": True},
+        NO_VIDEO,
+        STOPS,
+        "CloudFormation does not know AWS::KinesisVideo::SignalingChannel",
+    ),
     ("stacks", {}, {}, FINE, "none: a first one"),
     ("stacks", {}, stack_answers(ALL), FINE, "10 of 10"),
     *(
