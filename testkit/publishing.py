@@ -19,7 +19,8 @@ _LOOK_S = 0.01
 
 
 def say(line: str) -> None:
-    """Print a line for the program that has started this one."""
+    """Write a line for the program that has started this one, at once; print writes the newline separately,
+    so two threads' lines would mix."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 

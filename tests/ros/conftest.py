@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from testkit.ros import SYSTEM_PYTHON, RosGraph, python_with_rospy
+from tests.ros import process
 from tests.ros.process import Process
 
 SCRIPTS = Path(__file__).resolve().parent / "nodes"
@@ -45,32 +46,19 @@ def downlink(python: str, folder: Path, settings: object, *arguments: str) -> li
     return [python, str(SCRIPTS / "downlinks.py"), str(file), *arguments]
 
 
-class Graph:
-    """A ROS graph of its own: master, environment, and the processes in it. Tests that hold in either ROS use
-    what it has in common with tests/ros2's."""
+class Graph(process.Graph):
+    """A ROS graph of its own: master, environment, and the processes in it."""
 
     ros = 1
 
     def __init__(self, python: str, folder: Path) -> None:
-        self.python, self.folder = python, folder
         self._ros = RosGraph(python, folder)
-        self.environment = self._ros.environment
+        super().__init__(python, folder, self._ros.environment, SCRIPTS)
         self.master: Process
-        self._processes: list[Process] = []
 
     def start_master(self) -> None:
         self.master = self.start(self._ros.master)
         self._ros.await_master()
-
-    def run(self, script: str, *arguments: object) -> Process:
-        return self.start([self.python, str(SCRIPTS / script), *map(str, arguments)])
-
-    def module(self, module: str, *arguments: object) -> Process:
-        return self.start([self.python, "-m", module, *map(str, arguments)])
-
-    def listener(self, name: str, topic: str, kind: str) -> Process:
-        """Run a foreign subscriber, whose lines are ``connected``, then ``[time, message]``."""
-        return self.run("listener.py", name, topic, kind)
 
     def downlink(self, settings: object, *arguments: str) -> Process:
         """Run the agent's downlink alone; see nodes/downlinks.py."""
@@ -79,15 +67,6 @@ class Graph:
     def parameter(self, name: str, value: Any) -> None:
         with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"], allow_none=True) as proxy:
             proxy.setParam("/test", name, value)
-
-    def stop(self) -> None:
-        for process in reversed(self._processes):
-            process.kill()
-
-    def start(self, command: list[str]) -> Process:
-        process = Process(command, self.environment)
-        self._processes.append(process)
-        return process
 
 
 @pytest.fixture

@@ -36,6 +36,35 @@ def settled(socket: Path, streams: Sequence[str]) -> bool:
     return after is not None and after == before and after[0] == 0
 
 
+class Graph:
+    """A graph of either ROS, with the processes in it: ``scripts`` run in its Python and environment."""
+
+    def __init__(self, python: str, folder: Path, environment: dict[str, str], scripts: Path) -> None:
+        self.python, self.folder, self.environment = python, folder, environment
+        self._scripts = scripts
+        self._processes: list[Process] = []
+
+    def run(self, script: str, *arguments: object) -> Process:
+        """Run one of nodes/."""
+        return self.start([self.python, str(self._scripts / script), *map(str, arguments)])
+
+    def module(self, module: str, *arguments: object) -> Process:
+        return self.start([self.python, "-m", module, *map(str, arguments)])
+
+    def listener(self, name: str, topic: str, kind: str) -> Process:
+        """Run a foreign subscriber, whose lines are ``connected``, then ``[time, message]``."""
+        return self.run("listener.py", name, topic, kind)
+
+    def start(self, command: list[str]) -> Process:
+        process = Process(command, self.environment)
+        self._processes.append(process)
+        return process
+
+    def stop(self) -> None:
+        for process in reversed(self._processes):
+            process.kill()
+
+
 class Process:
     """A child whose output is read as it comes; the input line `quit` asks it to end."""
 
@@ -87,6 +116,14 @@ class Process:
     def alive(self) -> bool:
         """Whether it still runs."""
         return self._process.poll() is None
+
+    def status(self, socket: Path) -> dict[str, Any]:
+        """What an agent tells of itself; nothing while it starts."""
+        assert self.alive(), "\n".join(self.errors[-25:])
+        try:
+            return fetch(socket)
+        except AgentError:
+            return {}
 
     def until_said(self, text: str) -> None:
         """Wait for a text in the log."""

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from testkit.ros2 import ABSENT, Domain, Ros2, Ros2Error, find
+from tests.ros import process
 from tests.ros.conftest import downlink
 from tests.ros.process import Process
 
@@ -32,28 +33,16 @@ def ros2() -> Ros2:
         raise
 
 
-class Graph:
+class Graph(process.Graph):
     """A ROS 2 graph of its own: a domain that only this machine sees, and the processes in it."""
 
     ros = 2
 
     def __init__(self, ros2: Ros2, folder: Path) -> None:
-        self.ros2, self.python, self.folder = ros2, ros2.python, folder
-        self.domain = Domain()
-        self.environment = {
-            **ros2.alone(self.domain.number),
-            "ROS_LOG_DIR": str(folder),
-            "ROS_HOME": str(folder),
-        }
-        self._processes: list[Process] = []
+        self.ros2, self.domain = ros2, Domain()
+        own = {"ROS_LOG_DIR": str(folder), "ROS_HOME": str(folder)}
+        super().__init__(ros2.python, folder, {**ros2.alone(self.domain.number), **own}, SCRIPTS)
         self._numbers = itertools.count()
-
-    def run(self, script: str, *arguments: object) -> Process:
-        """Run one of nodes/."""
-        return self.start([self.python, str(SCRIPTS / script), *map(str, arguments)])
-
-    def module(self, module: str, *arguments: object) -> Process:
-        return self.start([self.python, "-m", module, *map(str, arguments)])
 
     def publisher(self, name: str, topic: str, kind: str, **options: Any) -> Process:
         """Run publisher.py; ``options`` are those of its command line, True for a flag."""
@@ -62,10 +51,6 @@ class Graph:
             flag = f"--{option.replace('_', '-')}"
             arguments += [flag] if value is True else [flag, value]
         return self.run("publisher.py", name, topic, kind, *arguments)
-
-    def listener(self, name: str, topic: str, kind: str) -> Process:
-        """Run a foreign subscriber, whose lines are ``connected``, then ``[time, message]``."""
-        return self.run("listener.py", name, topic, kind)
 
     def downlink(self, settings: object, *arguments: str) -> Process:
         """Run the agent's downlink alone; see tests/ros/nodes/downlinks.py."""
@@ -82,14 +67,8 @@ class Graph:
         """Run the command ``ros2``."""
         return self.start(["ros2", *map(str, arguments)])
 
-    def start(self, command: list[str]) -> Process:
-        process = Process(command, self.environment)
-        self._processes.append(process)
-        return process
-
     def stop(self) -> None:
-        for process in reversed(self._processes):
-            process.kill()
+        super().stop()
         self.domain.close()
 
 

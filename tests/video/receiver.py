@@ -2,18 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from iort_contract.counter import read_counter
+from testkit.video import counter_of
 from testkit.video_viewer import main
 
-
-def number_in(picture: Any) -> int | None:
-    """The number that a decoded picture shows."""
-    plane = picture.planes[0]
-    luma, line = memoryview(plane), plane.line_size
-    return read_counter(lambda x, y: luma[y * line + x], picture.width, picture.height)
-
-
 if __name__ == "__main__":
-    main(number_in)
+    main(counter_of)

@@ -18,8 +18,7 @@ from urllib.parse import urlsplit
 
 from typing_extensions import Self
 
-from iort_agent.errors import AgentError
-from iort_agent.status import SOCKET, fetch
+from iort_agent.status import SOCKET
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.commands import DRIVE_TYPE
 from iort_station.cloud import EMBEDDED
@@ -168,11 +167,7 @@ class Scene:
 
     def status(self) -> dict[str, Any]:
         """What the agent tells of itself; nothing while it starts."""
-        assert self.agent.alive(), "\n".join(self.agent.errors[-25:])
-        try:
-            return fetch(self.bundle.folder / SOCKET)
-        except AgentError:
-            return {}
+        return self.agent.status(self.bundle.folder / SOCKET)
 
     def passed(self) -> int:
         """How many commands have passed."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ssl
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
@@ -12,14 +12,7 @@ from iort_agent.config import load_config
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.verbs import connectivity
 from iort_station.fleet import robots
-from local.cloud import EmbeddedCloud
 from testkit.proxy import FREEZE, REFUSE, Proxy
-
-
-@pytest.fixture
-def proxy(embedded: EmbeddedCloud) -> Iterator[Proxy]:
-    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy:
-        yield proxy
 
 
 def go(bundle: robots.Bundle, proxy: Proxy) -> dict[str, Finding]:

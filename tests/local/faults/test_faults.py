@@ -44,12 +44,6 @@ def _settings(log: Path, port: int, **more):
     }
 
 
-@pytest.fixture
-def proxy(embedded: EmbeddedCloud):
-    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as running:
-        yield running
-
-
 def _killed(proxy: Proxy, over: threading.Event) -> None:
     over.wait(5)
     proxy.mode = REFUSE

@@ -12,8 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from iort_agent.common.threads import SystemClock
 from iort_agent.mqtt import aws, dispatch
 from iort_agent.mqtt.aws import IotCore
@@ -26,12 +24,6 @@ from local.cloud import EmbeddedCloud
 from testkit.mqtt import Robot
 from testkit.proxy import FREEZE, PASS, REFUSE, Proxy
 from testkit.waiting import until
-
-
-@pytest.fixture
-def proxy(embedded: EmbeddedCloud) -> Iterator[Proxy]:
-    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy:
-        yield proxy
 
 
 class UplinkLog:

@@ -14,7 +14,7 @@ import rospy
 from genpy.dynamic import generate_dynamic
 from std_msgs.msg import String
 
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 PARTS = {"Request": "", "Response": "bool success\nstring message"}
 

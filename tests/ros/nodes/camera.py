@@ -12,7 +12,7 @@ from iort_agent.common.threads import SystemClock
 from iort_agent.control.guard import NODES
 from iort_agent.video.config import VideoConfig
 from iort_agent.video.ros_camera import RosCamera
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 version, topic = int(sys.argv[1]), sys.argv[2]
 settings = {"source": {"type": "topic", "topic": topic}, "width": 128, "height": 96, "rate_hz": 10}

@@ -19,7 +19,7 @@ from iort_agent.common.schema import Place, load
 from iort_agent.common.threads import SystemClock
 from iort_agent.sources.registry import SOURCES
 from iort_contract.ros.message import RosMessage
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
 file = Path(sys.argv[1])

@@ -31,7 +31,7 @@ from iort_agent.ros.ros1_node import DEFAULT_NODE
 from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
 from iort_contract.messages.questions import Answer, Refusal, decode_ask, encode_answer
 from testkit.agent import Loopback, Published, link_of
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
 file = Path(sys.argv[1])

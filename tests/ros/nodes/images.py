@@ -4,7 +4,7 @@ change. An input line ends it."""
 import sys
 import threading
 
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 WIDTH, HEIGHT, BLUE = 64, 48, bytes((255, 0, 0))
 _FIELDS = {

@@ -9,7 +9,7 @@ import roslib.message
 import rospy
 
 from iort_agent.ros import ros1_master
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 
 def plain(value):

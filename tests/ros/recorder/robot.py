@@ -9,8 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from iort_agent.errors import AgentError
-from iort_agent.status import SOCKET, fetch
+from iort_agent.status import SOCKET
 from iort_contract.messages.recorder import UPLOADED, Incident, Trigger, encode_trigger
 from iort_station.data.incidents import incidents
 from iort_station.fleet import robots
@@ -141,11 +140,7 @@ class Robot:
 
     def status(self) -> dict[str, Any]:
         """What the agent tells of itself; nothing while it starts."""
-        assert self.agent.alive(), "\n".join(self.agent.errors[-25:])
-        try:
-            return fetch(self.bundle.folder / SOCKET)
-        except AgentError:
-            return {}
+        return self.agent.status(self.bundle.folder / SOCKET)
 
     def _ring_stopped(self) -> bool | None:
         """Whether the ring says that it has no room; None without a status."""

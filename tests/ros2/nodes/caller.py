@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 name, question = sys.argv[1:3]
 alone = "--alone" in sys.argv

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosidl_runtime_py import message_to_ordereddict
 from rosidl_runtime_py.utilities import get_message
 
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 name, topic, kind = sys.argv[1:4]
 rclpy.init(args=[])

@@ -14,7 +14,7 @@ import rclpy
 from rclpy.qos import QoSProfile
 from rosidl_runtime_py.utilities import get_message
 
-from tests.ros.nodes import say
+from testkit.publishing import say
 
 name, kinds = sys.argv[1], dict(one.split("=") for one in sys.argv[2:])
 rclpy.init(args=[])
