@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import signal
 import socket
 import sys
 import threading
@@ -16,7 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
@@ -47,7 +46,7 @@ from local import ros2_car
 from local.cloud import FOLDER, EmbeddedCloud
 from local.deployment import ROOT
 from local.figures import Figures, Spread, round_trips
-from local.processes import Child, LocalError
+from local.processes import Child, LocalError, interrupt_by_signals
 
 
 def read() -> argparse.Namespace:
@@ -162,14 +161,8 @@ def main() -> None:
     given = read()
     stopped = threading.Event()
 
-    def interrupt(_signal: int, _frame: object) -> NoReturn:
-        # Python drops an exception that is raised while it forks, so the event is set too.
-        stopped.set()
-        raise KeyboardInterrupt
-
     # Every signal that stops the demo stops the processes that it started.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, interrupt)
+    interrupt_by_signals(stopped)
     console = Console()
     try:
         figures = _Demo(given, console, stopped).run()

@@ -8,9 +8,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import NoReturn
 
 
 class LocalError(Exception):
@@ -19,6 +21,18 @@ class LocalError(Exception):
 
 class EmulatorError(LocalError):
     """The emulator ended, and nobody has stopped it; errors of its clients come from this."""
+
+
+def interrupt_by_signals(stopped: threading.Event) -> None:
+    """Let SIGINT, SIGTERM and SIGHUP set the event and raise `KeyboardInterrupt`."""
+
+    def interrupt(_signal: int, _frame: object) -> NoReturn:
+        # Python drops an exception that is raised while it forks, so the event is set too.
+        stopped.set()
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, interrupt)
 
 
 _PR_SET_PDEATHSIG = 1

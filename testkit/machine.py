@@ -84,6 +84,11 @@ def usage_below(pid: int) -> Usage:
     return sum(map(usage_of, descendants(pid)), Usage(0.0, 0.0))
 
 
+def usages(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, Usage]:
+    """Return the usage of each process with its descendants: a script such as `rosbag` starts what works."""
+    return {who: usage_of(one.pid) + usage_below(one.pid) for who, one in processes.items()}
+
+
 def descendants(pid: int) -> list[int]:
     """Return every process below ``pid``, without ``pid``."""
     parents: dict[int, list[int]] = {}

@@ -10,23 +10,21 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import subprocess
 import tempfile
 import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bench.floors.mosquitto import Mosquitto, found, subscribed
+from bench.load.counting import await_received, finish
 from bench.report import NOT_MEASURED, Section
 from bench.ros.mixed_robot import MIXED, topics
 from bench.sections import Declared
-from iort_agent.errors import AgentError
-from iort_agent.status import SOCKET, fetch
+from iort_agent.status import SOCKET
 from iort_contract.messages.batch import decode_batch
 from iort_contract.topics import LIVE, RECORD, parse_topic
 from testkit import machine
@@ -117,16 +115,21 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Recorded:
             publisher.go()
         publishers[0].publish_for(_WARM_UP_S)
         say(f"driving for {seconds} s")
-        before, began = _used(processes), time.monotonic()
+        before, began = machine.usages(processes), time.monotonic()
         publishers[0].publish_for(seconds - 1)
-        after, result.seconds = _used(processes), time.monotonic() - began
+        after, result.seconds = machine.usages(processes), time.monotonic() - began
         for publisher in publishers:
             result.published.update(json.loads(publisher.finish()))
         ended = time.monotonic()
         say("waiting for what is under way")
-        _await_received(car.parent / SOCKET, result.published)
-        _finish(processes[RECORDER], signal.SIGINT)
-        _finish(processes[AGENT], signal.SIGTERM)
+        streams = {one.stream: result.published[one.name] for one in topics().values()}
+        await_received(
+            car.parent / SOCKET,
+            lambda received: all(received.get(stream, 0) >= count for stream, count in streams.items()),
+            within_s=_CATCH_UP_S,
+        )
+        finish(processes[RECORDER], signal.SIGINT, within_s=_CATCH_UP_S + _END_S)
+        finish(processes[AGENT], signal.SIGTERM, within_s=_CATCH_UP_S + _END_S)
         # The agent's last messages are on their way from the broker to the watcher.
         threading.Event().wait(1.0)
         result.agent = json.loads(written.read_text())
@@ -140,30 +143,6 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Recorded:
         result.used[who] = machine.Usage(usage.cpu_s - before[who].cpu_s, usage.rss_mb)
     count(result, heard, ended)
     return result
-
-
-def _used(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, machine.Usage]:
-    # `rosbag` is a script that has started the recorder.
-    return {who: machine.usage_of(one.pid) + machine.usage_below(one.pid) for who, one in processes.items()}
-
-
-def _await_received(socket: Path, published: Mapping[str, int]) -> None:
-    """Wait until the agent has received all messages, or for so long that some must be lost."""
-    until, streams = time.monotonic() + _CATCH_UP_S, {one.name: one.stream for one in topics().values()}
-    while time.monotonic() < until:
-        with suppress(AgentError):  # it is too busy to answer
-            received = {stream: one["samples"] for stream, one in fetch(socket)["streams"].items()}
-            if all(received.get(streams[name], 0) >= count for name, count in published.items()):
-                return
-        time.sleep(0.2)  # the agent gives no notice
-
-
-def _finish(process: subprocess.Popen[str], number: signal.Signals) -> None:
-    process.send_signal(number)
-    try:
-        process.wait(_CATCH_UP_S + _END_S)
-    except subprocess.TimeoutExpired as error:
-        raise InstrumentError(f"{process.args!r:.80} did not end") from error
 
 
 def _in_bag(bag: Path) -> Counter[str]:

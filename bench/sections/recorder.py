@@ -190,9 +190,9 @@ def _measure(program: str, ros2: Ros2 | None, seconds: int) -> Run:
         pause.wait(_WARM_UP_S)
         status = _status(cars[WITH])
         warm = {who: len(found) for who, found in delays.items()}
-        written, before, began = _written(status, folder), _used(processes), time.monotonic()
+        written, before, began = _written(status, folder), machine.usages(processes), time.monotonic()
         pause.wait(seconds)
-        after, took_s = _used(processes), time.monotonic() - began
+        after, took_s = machine.usages(processes), time.monotonic() - began
         status = _status(cars[WITH])
         now_written = _written(status, folder)
         live = {who: Spread.of(found[warm[who] :]) for who, found in delays.items()}
@@ -241,11 +241,6 @@ def _written(status: Mapping[str, Any], folder: Path) -> dict[str, int]:
     """The bytes that the ring and ROS' recorder have written so far."""
     bag = sum(path.stat().st_size for path in (*folder.glob("bag*.bag*"), *folder.glob("bag/*")))
     return {WITH: round(status["recorder"]["ring"]["written_mb"] * 1e6), **({RECORDER: bag} if bag else {})}
-
-
-def _used(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, machine.Usage]:
-    # `rosbag` and `ros2` may have started the recorder.
-    return {who: machine.usage_of(one.pid) + machine.usage_below(one.pid) for who, one in processes.items()}
 
 
 def _say(process: subprocess.Popen[str], line: str) -> None:

@@ -34,11 +34,11 @@ from typing import Any
 from bench.floors import mosquitto
 from bench.floors.mosquitto import ROBOT, Mosquitto, subscribed
 from bench.floors.raw_mqtt import RawClient
+from bench.load.counting import await_received, finish
 from bench.report import NOT_MEASURED, Report, Section
 from bench.ros.ros2_loads import BIG, FAST, LIVE, LOADS, MANY, SPREAD, Load
 from bench.sections import Declared, Option
-from iort_agent.errors import AgentError
-from iort_agent.status import SOCKET, fetch
+from iort_agent.status import SOCKET
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.live import decode_live
@@ -48,7 +48,7 @@ from local.figures import Spread
 from testkit import machine
 from testkit.ros2 import Ros2, Ros2Error, Ros2Graph, find
 from testkit.target import Say, Target
-from testkit.waiting import InstrumentError, reached
+from testkit.waiting import InstrumentError
 
 AGENT, FLOOR, RECORDER = "agent", "bare rclpy subscriber", "ros2 bag record"
 # The most: processor time as a multiple of the bare subscriber's, and ms after its arrival.
@@ -146,12 +146,16 @@ def _measure(program: str, ros2: Ros2, middleware: str, name: str, each: int, *,
         rss_mb = {who: machine.usage_of(one.pid).rss_mb for who, one in processes.items()}
         if int(publisher.finish()) != count:
             raise InstrumentError("the publisher has another count")
-        _await_received(car.parent / SOCKET, streams, count)
+        await_received(
+            car.parent / SOCKET,
+            lambda received: sum(received.get(stream, 0) for stream in streams) >= count,
+            within_s=_CATCH_UP_S,
+        )
         counted = {FLOOR: _counted(processes[FLOOR])}
         if RECORDER in processes:
-            _finish(processes[RECORDER], signal.SIGINT)
+            finish(processes[RECORDER], signal.SIGINT, within_s=_CATCH_UP_S + _END_S)
             counted[RECORDER] = _in_bag(bag)
-        _finish(processes[AGENT], signal.SIGTERM)
+        finish(processes[AGENT], signal.SIGTERM, within_s=_CATCH_UP_S + _END_S)
         source = json.loads(written.read_text())["sources"][0]
         counted[AGENT] = _arrived(heard, streams)
     messages = took_s * load.rate_hz * len(load.topics)
@@ -181,32 +185,12 @@ def _threads(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, dict[s
     return used
 
 
-def _await_received(socket: Path, streams: set[str], count: int) -> None:
-    """Wait until the agent has received all messages, or for so long that some must be lost."""
-
-    def received() -> bool:
-        with suppress(AgentError):  # it is too busy to answer
-            counts: dict[str, Any] = fetch(socket)["streams"]
-            return sum(int(counts.get(stream, {}).get("samples", 0)) for stream in streams) >= count
-        return False
-
-    reached(received, within_s=_CATCH_UP_S, poll_s=0.2)
-
-
 def _counted(floor: subprocess.Popen[str]) -> int:
     assert floor.stdin is not None
     assert floor.stdout is not None
     floor.stdin.write("\n")
     floor.stdin.flush()
     return int(floor.stdout.readline())
-
-
-def _finish(process: subprocess.Popen[str], number: signal.Signals) -> None:
-    process.send_signal(number)
-    try:
-        process.wait(_CATCH_UP_S + _END_S)
-    except subprocess.TimeoutExpired as error:
-        raise InstrumentError(f"{process.args!r:.80} did not end") from error
 
 
 def _in_bag(bag: Path) -> int:

@@ -8,7 +8,6 @@ import argparse
 import os
 import platform
 import resource
-import signal
 import socket
 import ssl
 import sys
@@ -19,7 +18,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from importlib.metadata import version
 from types import TracebackType
-from typing import Any, NoReturn
+from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
@@ -36,7 +35,7 @@ from iort_station.page.password import Password, first_password
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.network.servers import Listen, is_ipv6
-from local.processes import EmulatorError, LocalError
+from local.processes import EmulatorError, LocalError, interrupt_by_signals
 from local.state import FILE, NO, VERSION, Settings, StateFolder
 from local.up import commands
 from local.up.network_page import SOCKET, NetworkPage
@@ -125,13 +124,7 @@ def main() -> None:
     parser = commands.parser("up", "Run the stacks in a cloud of your own, which is kept.", remembered=True)
     given, stopped = parser.parse_args(), threading.Event()
 
-    def stop(_signal: int, _frame: object) -> NoReturn:
-        # Python drops an exception that is raised while it forks, so the event is set too.
-        stopped.set()
-        raise KeyboardInterrupt
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, stop)
+    interrupt_by_signals(stopped)
     # For sockets: whoever opens many must not take those of the robots. The emulator inherits it.
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))

@@ -33,13 +33,13 @@ from iort_analysis.archive.columns import (
 )
 from iort_analysis.archive.reading import HOURS, KINDS, ArchiveFile
 from iort_analysis.samples.batches import Steps, decode_steps, steps_of
-from iort_analysis.samples.blocks import Block, Column, column_of, join, objects
+from iort_analysis.samples.blocks import Block, Column, exact, join
 from iort_contract.archive import Hour, content_hash, item_hash
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.checks import integer
-from iort_contract.codec import EXACT, packed_samples, unpacked
+from iort_contract.codec import packed_samples, unpacked
 from iort_contract.dynamodb import Item, plain, whole
-from iort_contract.limits import ContractError, Value
+from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Envelope, open_envelope, read_envelope
 from iort_contract.ros.columns import view
 from iort_contract.ros.message import Messages, unpack
@@ -164,14 +164,8 @@ def _alone(item: Item, envelope: Envelope) -> tuple[_Entry, Block]:
     messages = unpack(envelope.behind, n) if envelope.serialized else None
     viewed = {} if messages is None else view(messages)[0]
     entry = _Entry(item, _head(envelope), about, list(beside), messages, list(viewed))
-    samples = {name: _exact(values) for name, values in {**viewed, **beside}.items()}
+    samples = {name: exact(values) for name, values in {**viewed, **beside}.items()}
     return entry, Block(np.array(times, dtype=np.int64), samples)
-
-
-def _exact(values: Sequence[Value]) -> Column:
-    """A column; with integers of more than 53 bits as Python's: a float64 does not tell them from floats."""
-    large = any(type(value) is int and abs(value) >= EXACT for value in values)
-    return objects(values) if large else column_of(values)
 
 
 def _piece(parts: list[tuple[list[_Entry], Block]]) -> Piece:

@@ -88,6 +88,12 @@ def column_of(column: Sequence[Value]) -> Column:
     return array
 
 
+def exact(column: Sequence[Value]) -> Column:
+    """The same, with integers of more than 53 bits as Python's: a float64 does not tell them from floats."""
+    large = any(type(value) is int and abs(value) >= EXACT for value in column)
+    return objects(column) if large else column_of(column)
+
+
 def objects(column: Sequence[Any]) -> Column:
     """A column of Python objects."""
     array = np.empty(len(column), dtype=object)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_analysis.samples.blocks import Column, column_of, objects, values
+from iort_analysis.samples.blocks import Column, exact, objects, values
 from iort_contract.checks import wire_column
 from iort_contract.codec import EXACT
 from iort_contract.limits import MAX_FIELD_CHARACTERS, MAX_FIELDS, ContractError, MessageError, Value
@@ -71,7 +71,7 @@ class Flattener:
             found, _ = view(Messages(self._kind.id, self._kind.layout, [raws[row]]))
             shape_of[row] = len(shapes)
             shapes.append(list(found))
-            own = {name: _exact(column) for name, column in found.items()}
+            own = {name: exact(column) for name, column in found.items()}
             parts.append((np.array([row]), own))
         if not parts:
             return Flat({}, [()], shape_of)
@@ -121,11 +121,6 @@ def _column(place: Place | Value, data: NDArray[np.uint8]) -> Column:
     if kind.kind == "f" and not (finite := np.isfinite(floats)).all():
         floats[~finite] = np.nan
     return floats
-
-
-def _exact(column: Sequence[Value]) -> Column:
-    large = any(type(value) is int and abs(value) >= EXACT for value in column)
-    return objects(column) if large else column_of(column)
 
 
 def together(parts: Sequence[tuple[NDArray[np.intp], dict[str, Column]]], n: int) -> dict[str, Column]:
