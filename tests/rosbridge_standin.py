@@ -23,6 +23,7 @@ from typing_extensions import Self
 
 from iort_contract.ros.definition import DURATION, TIME, Field, parse
 from testkit.ports import free_port
+from testkit.waiting import GUARD_S
 
 
 class RosbridgeStandin:
@@ -65,12 +66,12 @@ class RosbridgeStandin:
         ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(ready,), name="rosbridge", daemon=True)
         self._thread.start()
-        assert ready.wait(60)
+        assert ready.wait(GUARD_S)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._loop.call_soon_threadsafe(self._over.set)
-        self._thread.join(60)
+        self._thread.join(GUARD_S)
         assert not self._thread.is_alive()
 
     def wait_for(self, operation: str, count: int = 1, **members: Any) -> dict[str, Any]:

@@ -18,6 +18,8 @@ from typing import Callable, List
 
 from typing_extensions import Self
 
+from testkit.waiting import GUARD_S
+
 FIRMWARE = b"\x00\x06\x02" + b"60_MK6\x00" + bytes(12) + b"\x00\x00\x00"
 
 
@@ -73,7 +75,7 @@ class VescStandin:
     def __exit__(self, *_: object) -> None:
         self.unplug()
         self._do(lambda: setattr(self, "_done", True))
-        self._thread.join(60)
+        self._thread.join(GUARD_S)
         os.close(self._wake_in)
         os.close(self._wake_out)
 
@@ -93,7 +95,7 @@ class VescStandin:
         done = threading.Event()
         self._commands.put((command, done))
         os.write(self._wake_in, b"x")
-        assert done.wait(60)
+        assert done.wait(GUARD_S)
 
     def _plug(self) -> None:
         self._master, self._slave = os.openpty()

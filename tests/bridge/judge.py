@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from typing_extensions import Self
 
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 
 PLAYING, PAUSED, BUFFERING, ENDED = range(4)
 
@@ -55,7 +55,7 @@ class Judge:
     def __exit__(self, *_error: object) -> None:
         assert self._process.stdin is not None
         self._process.stdin.close()
-        self._process.wait(60)
+        self._process.wait(GUARD_S)
         self._reader.join()
         assert self._process.stdout is not None
         self._process.stdout.close()

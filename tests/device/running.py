@@ -9,6 +9,7 @@ from typing_extensions import Self
 
 from iort_agent.common.threads import SystemClock
 from iort_contract.catalog.streams import TYPES_STREAM
+from testkit.waiting import GUARD_S
 
 
 class Running:
@@ -29,7 +30,7 @@ class Running:
 
     def __exit__(self, *_: object) -> None:
         self.stop.set()
-        self.thread.join(60)
+        self.thread.join(GUARD_S)
         assert not self.thread.is_alive()
         assert self.failed is None
 

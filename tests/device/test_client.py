@@ -13,6 +13,7 @@ import pytest
 from awscrt import io, mqtt5
 
 from iort_agent.mqtt.client import keep_state, send_at_once
+from testkit.waiting import GUARD_S
 
 
 def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
@@ -45,11 +46,11 @@ def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
         )
         client.start()
         try:
-            assert not found.get(timeout=60)
-            return found.get(timeout=60)
+            assert not found.get(timeout=GUARD_S)
+            return found.get(timeout=GUARD_S)
         finally:
             client.stop()
-            assert stopped.wait(60), "its thread would call back in later tests"
+            assert stopped.wait(GUARD_S), "its thread would call back in later tests"
 
 
 @pytest.mark.parametrize(("at_the_first", "kept"), [(keep_state, True), (lambda: None, False)])

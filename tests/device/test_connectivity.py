@@ -24,6 +24,7 @@ from iort_agent.config import load_config
 from iort_agent.sources import FAIL, OK, Finding
 from iort_agent.verbs import connectivity
 from testkit.ports import free_port
+from testkit.waiting import GUARD_S
 
 NOW = datetime.now(timezone.utc)
 DAY = timedelta(days=1)
@@ -53,7 +54,7 @@ def serving(answer: Callable[[socket.socket], object], host: str = "127.0.0.1") 
             yield server.getsockname()[1]
         finally:
             server.shutdown(socket.SHUT_RDWR)
-            thread.join(10)
+            thread.join(GUARD_S)
 
 
 def dated(authority: trustme.CA, host: str, first: datetime, last: datetime) -> trustme.LeafCert:
@@ -198,7 +199,11 @@ def in_namespace(*commands: str) -> subprocess.CompletedProcess[str]:
     """Run shell commands as root of a network of their own."""
     unshare = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--user", "--map-root-user", "--net"]
     return subprocess.run(
-        [*unshare, "sh", "-ec", "\n".join(commands)], capture_output=True, text=True, timeout=60, check=False
+        [*unshare, "sh", "-ec", "\n".join(commands)],
+        capture_output=True,
+        text=True,
+        timeout=GUARD_S,
+        check=False,
     )
 
 

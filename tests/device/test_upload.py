@@ -39,6 +39,7 @@ from iort_contract.messages.files import (
 from iort_contract.messages.recorder import UPLOADED, Take, Trigger, Wanted
 from iort_contract.topics import ACCEPTED, FILE, PING, build_topic
 from testkit.agent import Loopback, ManualClock, MemorySpool, link_of
+from testkit.waiting import GUARD_S
 from tests.store_standin import store
 from tests.unit.agent.recorder import rig as recorder_rig
 from tests.unit.agent.recorder.rig import S
@@ -83,7 +84,7 @@ class WaitingClock(ManualClock):
         for _ in range(4):
             called = threading.Event()
             self._dispatcher.post(called.set)
-            assert called.wait(60)
+            assert called.wait(GUARD_S)
         return super().wait(event, seconds)
 
 

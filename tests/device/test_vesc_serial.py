@@ -17,7 +17,7 @@ from iort_agent.common.threads import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources.vesc import VescConfig, why
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 from tests.device.running import Running
 from tests.unit.agent.test_agent import config_file
 from tests.vesc_standin import FIRMWARE, VescStandin, framed, values
@@ -233,7 +233,7 @@ def test_the_source_stops_at_once(vesc: VescStandin, trouble: str) -> None:
     with Running(config(vesc, timeout_s=30.0)) as running:
         until(lambda: trouble == "absent" or bool(vesc.asked))
         running.stop.set()
-        running.thread.join(25)
+        running.thread.join(GUARD_S)
         assert not running.thread.is_alive(), "it waited for an answer"
 
 

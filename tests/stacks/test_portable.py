@@ -9,6 +9,7 @@ import sys
 
 from iort_contract.catalog.rules import RULES, Republish
 from stacks.settings import ROOT
+from testkit.waiting import GUARD_S
 from tests.stacks.test_updates import identity
 from verify.preflight.account import BOOTSTRAP, BOOTSTRAP_PARAMETER
 from verify.preflight.deployed import STACKS
@@ -35,7 +36,12 @@ expanded = [iot._expand_republish_topic(action, "ping/iort/car/rule") for action
 print(json.dumps([sorted(iot._IMPLEMENTED_SQL_FUNCS), expanded]))
 """
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=GUARD_S,
     )
     assert done.returncode == 0, done.stderr
     functions, expanded = json.loads(done.stdout.splitlines()[-1])

@@ -10,6 +10,7 @@ from iort_contract.catalog.derived import F1TENTH
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import channel as pubnub_channel
 from iort_contract.messages.live import LiveSample, live_update
+from testkit.waiting import GUARD_S
 
 # Of a page that hears nobody.
 SETTINGS = {"namespace": "iort", "subscribe_key": "sub-c-1", "origin": "127.0.0.1:9", "tls": False}
@@ -52,7 +53,7 @@ class Car:
 
     def publish(self, message, channel=None):
         host, port = self.pubnub.origin.split(":")
-        connection = http.client.HTTPConnection(host, int(port), timeout=60)
+        connection = http.client.HTTPConnection(host, int(port), timeout=GUARD_S)
         path = f"/publish/{PUBLISH_KEY}/{SUBSCRIBE_KEY}/0/{channel or pubnub_channel(self.name)}/0"
         connection.request("POST", path, json.dumps(message), {"Content-Type": "application/json"})
         assert connection.getresponse().status == 200

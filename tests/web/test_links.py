@@ -65,7 +65,7 @@ def test_a_page_of_many_cars_subscribes_within_the_limit_of_a_request(open_page,
             "robots": [f"car{i}" for i in range(MOST_FILTERS + 1)],
         }
         page = open_page(serve(live="iot", broker=socket, identity=identity).url)
-        until(lambda: page.inner_text("#link") == "Connected", "the page to connect", 15)
+        until(lambda: page.inner_text("#link") == "Connected", "the page to connect")
     assert broker.asked == [MOST_FILTERS, 1]
 
 
@@ -97,7 +97,7 @@ def test_only_a_page_of_this_machine_gets_through(relay, origin, status):
     socket = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Protocol": "mqtt"}
     call = {"Content-Type": "application/x-amz-json-1.1", "X-Amz-Target": "AWSCognitoIdentityService.GetId"}
     for method, path, headers in (("GET", "/mqtt", socket), ("POST", "/", call)):
-        connection = http.client.HTTPConnection(relay.host, relay.port, timeout=30)
+        connection = http.client.HTTPConnection(relay.host, relay.port, timeout=GUARD_S)
         connection.request(method, path, headers=headers | ({"Origin": origin} if origin else {}))
         assert connection.getresponse().status == status
         connection.close()
@@ -108,13 +108,13 @@ HIDE = """(hidden) => {
   document.dispatchEvent(new Event("visibilitychange"));
 }"""
 
-# The states of a car until it is stale, and how long it has been silent then.
+# The states of a car until it is stale, and how long it had been silent at each look.
 UNTIL_STALE = """() => new Promise((done) => {
   const states = [];
   const look = () => {
     const { state, silent_s } = iort.robots["car-1"];
-    states.push(state);
-    if (["stale", "gone"].includes(state)) done([states, silent_s]);
+    states.push([state, silent_s]);
+    if (["stale", "gone"].includes(state)) done(states);
     else setTimeout(look, 20);
   };
   look();
@@ -206,13 +206,14 @@ def test_an_idle_car_is_not_stale_and_is_gone_when_it_breaks_its_word(page, car)
     assert page.inner_text("#count") == "1 idle"
     assert "cannot wake cars" in page.inner_text(".foot")
     show(page, car.send(next_ms=4_000))
-    states, silent_s = page.evaluate(UNTIL_STALE)
-    assert set(states) - {"live"} == {"idle", "stale"}
-    assert silent_s >= 5.4
+    # After its word and a little more; a busy machine may look at it later.
+    word_s = 5.4
+    *before, (_, silent_s) = page.evaluate(UNTIL_STALE)
+    assert {state for state, _ in before} <= {"live", "idle"}
+    assert silent_s >= word_s
     # The promise of ten a second.
     show(page, car.send(next_ms=100))
-    _, silent_s = page.evaluate(UNTIL_STALE)
-    assert silent_s < 5.4
+    assert all(silent_s < word_s for _, silent_s in page.evaluate(UNTIL_STALE)[:-1])
     car.send(next_ms=10**6)
     until(lambda: page.evaluate("iort.malformed") == 1, "a time that no car may say")
 

@@ -25,6 +25,7 @@ from iort_station.page.places import (
     client_of,
 )
 from iort_station.page.server import PageServer
+from testkit.waiting import GUARD_S
 from tests.web.cars import SETTINGS
 
 HERE = "127.0.0.1"
@@ -42,7 +43,7 @@ class Held:
     def wait(self, count):
         """Wait until so many more have begun."""
         for _ in range(count):
-            assert self.begun.acquire(timeout=60)
+            assert self.begun.acquire(timeout=GUARD_S)
 
     def answer(self, name):
         def hold(_asked):
@@ -105,7 +106,7 @@ class Client:
 
     def _open(self):
         connection = http.client.HTTPConnection(
-            self._page.host, self._page.port, timeout=60, source_address=(self._address, 0)
+            self._page.host, self._page.port, timeout=GUARD_S, source_address=(self._address, 0)
         )
         return self._stack.enter_context(closing(connection))
 
@@ -181,7 +182,7 @@ def test_what_cannot_wait_is_refused_with_a_reason(page, held):
     with ExitStack() as stack:
         client = Client(page, stack)
         requests = [client.begin("/runs.json") for _ in range(ANSWERS_OF_KIND + MOST_WAITING + 1)]
-        (refused,), _, _ = select.select([one.sock for one in requests], [], [], 60)
+        (refused,), _, _ = select.select([one.sock for one in requests], [], [], GUARD_S)
         (last,) = (one for one in requests if one.sock is refused)
         requests.remove(last)
         answer = last.getresponse()

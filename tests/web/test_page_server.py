@@ -24,6 +24,7 @@ from iort_station.page.history import MOST_BYTES
 from iort_station.page.page import BUILT, config, load_track
 from iort_station.page.server import PageServer, on_loopback
 from testkit.ports import free_port
+from testkit.waiting import GUARD_S
 from tests.web.cars import SETTINGS
 
 
@@ -48,7 +49,9 @@ def plain(built):
 
 def ask(page, path, method="GET", headers=None, body=None):
     address = urlsplit(page.url)
-    with closing(http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)) as connection:
+    with closing(
+        http.client.HTTPConnection(address.hostname or "", address.port, timeout=GUARD_S)
+    ) as connection:
         connection.request(method, path, body and body.encode(errors="surrogatepass"), headers or {})
         answer = connection.getresponse()
         return answer, answer.read()
@@ -127,7 +130,7 @@ def test_a_slow_answer_delays_neither_a_file_nor_the_shutdown(built):
             socket.create_connection((page.host, page.port)) as waiting,
         ):
             waiting.sendall(b"GET /slow.json HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            assert asked.wait(60)
+            assert asked.wait(GUARD_S)
             assert ask(page, "/page.js")[0].status == 200
             page.stop()
             assert waiting.recv(1) == b""
@@ -459,17 +462,17 @@ class Failing(BackgroundServer):
 
 def test_each_task_of_a_server_goes_on_after_an_unexpected_exception(caplog):
     def ask_it(server):
-        with closing(http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)) as connection:
+        with closing(http.client.HTTPConnection("127.0.0.1", server.port, timeout=GUARD_S)) as connection:
             connection.request("GET", "/")
             return connection.getresponse().status
 
     with Failing() as server:
         port = server.port
-        assert server.looked.wait(60)
+        assert server.looked.wait(GUARD_S)
         assert "Failing's closing of silent connections has failed" in caplog.text
         with suppress(OSError, http.client.HTTPException):
             ask_it(server)
-        assert server.again.wait(60)
+        assert server.again.wait(GUARD_S)
         assert "a fault of the loop" in caplog.text
         assert (server.port, ask_it(server)) == (port, 200)
     # It ends, also while it waits for its next start.
@@ -512,13 +515,13 @@ def test_pictures_of_incidents_hold_up_neither_each_other_nor_reading(built):
     def picture(asked):
         making.append(asked["id"])
         begun.release()
-        assert may.wait(30)
+        assert may.wait(GUARD_S)
         return {"jpeg": ""}
 
     answers = {"incident_picture": picture, "robots": lambda _: {"robots": {}}}
     with PageServer(**SETTINGS, built=built, answers=answers) as page, ThreadPoolExecutor(6) as viewers:
         asked = [viewers.submit(ask, page, f"/incident_picture.json?id={i}") for i in range(6)]
-        assert begun.acquire(timeout=30)
+        assert begun.acquire(timeout=GUARD_S)
         # Whoever reads something else has an answer meanwhile, more often than there are places in all.
         assert [ask(page, "/robots.json")[0].status for _ in range(20)] == [200] * 20
         assert len(making) == 1
@@ -538,7 +541,7 @@ def test_a_file_of_the_most_bytes_is_sent_whole(built):
     with PageServer(**SETTINGS, built=built, downloads={"incident.mcap": download}) as page:
         address = urlsplit(page.url)
         with closing(
-            http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
+            http.client.HTTPConnection(address.hostname or "", address.port, timeout=GUARD_S)
         ) as connection:
             connection.request("GET", "/incident.mcap")
             answer = connection.getresponse()

@@ -55,7 +55,7 @@ def cloud(monkeypatch, streams):
         # An invocation notes how far its mapping is after the function has answered.
         for thread in threading.enumerate():
             if thread.name.endswith("(_invoke)"):
-                thread.join(60)
+                thread.join(GUARD_S)
         del lambda_svc._esms["gap-mapping"]
         dynamodb._delete_table({"TableName": "gap"})
         sqs._queues.clear()
@@ -149,7 +149,7 @@ def test_the_poller_wakes_at_the_end_of_the_window(cloud):
     cloud.put(0)
     lambda_svc._esm_wake.clear()
     assert not cloud.mappings.poll()
-    assert lambda_svc._esm_wake.wait(60)
+    assert lambda_svc._esm_wake.wait(GUARD_S)
     cloud.poll_until(lambda: cloud.seen)
     assert cloud.seen == [[0]]
 

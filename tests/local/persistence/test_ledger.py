@@ -16,6 +16,7 @@ import pytest
 from local.deployment import ROOT
 from local.persistence import ledger as ledger_module
 from local.persistence.ledger import VERSION, Ledger, LedgerError, settle
+from testkit.waiting import GUARD_S
 
 
 @pytest.fixture
@@ -121,7 +122,7 @@ except LedgerError:
 
 def test_a_commit_without_room_on_the_disk_is_undone(tmp_path):
     command = [sys.executable, "-c", FULL_AT_COMMIT, str(tmp_path / "ledger.db")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=GUARD_S, check=False)
     assert done.stdout == "[(1,), (3,)]\n", done.stderr
 
 
@@ -169,14 +170,14 @@ def test_one_fsync_serves_all_who_wait(tmp_path, monkeypatch):
 
     def fdatasync(_file):
         running.set()
-        assert go_on.wait(60)
+        assert go_on.wait(GUARD_S)
         synced.append(stored(ledger))
 
     monkeypatch.setattr(os, "fdatasync", fdatasync)
     put(ledger, 0)
     threads = [threading.Thread(target=ledger.commit)]
     threads[0].start()
-    assert running.wait(60)
+    assert running.wait(GUARD_S)
     for n in range(1, 10):
         # The disk is busy, and others go on writing.
         put(ledger, n)
@@ -186,7 +187,7 @@ def test_one_fsync_serves_all_who_wait(tmp_path, monkeypatch):
         time.sleep(0.001)
     go_on.set()
     for thread in threads:
-        thread.join(60)
+        thread.join(GUARD_S)
     assert len(synced) == 2
     assert synced[1] == list(range(10))
     ledger.close()

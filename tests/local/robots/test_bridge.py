@@ -20,7 +20,7 @@ from iort_station import data
 from iort_station.cloud import EMBEDDED
 from iort_station.operations import audit
 from local.demo import DOWNLINK
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 from tests.bridge.judge import Judge
 from tests.local.data.drives import Agent
 from tests.local.robots.test_shadow import Shadow
@@ -40,7 +40,7 @@ def bridge(folder: Path, *arguments: str) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
         finally:
             process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=60)
+            _, errors = process.communicate(timeout=GUARD_S)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
 

@@ -40,6 +40,7 @@ from iort_contract.messages.video import VideoTerms
 from iort_contract.ros.message import MessageType, message_type
 from iort_contract.topics import SHADOW
 from testkit.agent import Loopback, MemorySpool, Published
+from testkit.waiting import GUARD_S
 
 T0 = 1_700_000_000_000_000
 RECORD = "$aws/rules/iort_record/dt/iort/car1"
@@ -224,7 +225,7 @@ def test_stop_ends_the_run_in_good_order() -> None:
     def endless(emit: Emit, stop: threading.Event) -> None:
         drive(emit, stop)
         rig.runtime.stop()
-        assert stop.wait(60)
+        assert stop.wait(GUARD_S)
 
     rig = Rig(endless)
     assert rig.runtime.run(drain_s=10) == 0
@@ -358,7 +359,7 @@ def test_one_refused_sample_is_not_a_failure() -> None:
 def test_a_source_that_was_stopped_before_its_first_sample_has_not_failed() -> None:
     def wait(emit: Emit, stop: threading.Event) -> None:
         rig.runtime.stop()
-        assert stop.wait(60)
+        assert stop.wait(GUARD_S)
 
     rig = Rig(wait)
     assert rig.runtime.run(drain_s=10) == 0
@@ -369,7 +370,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
 
     def wait_for_pings(emit: Emit, stop: threading.Event) -> None:
         emit("vesc", T0, {"speed": 1})
-        assert enough.wait(60)
+        assert enough.wait(GUARD_S)
 
     rig = Rig(wait_for_pings, ping=PingConfig(rate_hz=20, paths=("broker",)))
     seen: list[Published] = []
@@ -440,7 +441,7 @@ def test_the_agents_metrics_are_a_stream() -> None:
 
     def wait(emit: Emit, stop: threading.Event) -> None:
         emit("vesc", T0, {"speed": 1})
-        assert seen.wait(60)
+        assert seen.wait(GUARD_S)
 
     rig = Rig(wait, metrics=MetricsConfig(every_s=0.1), record=RecordConfig(batch_s=0))
     rig.uplink.verdict = lambda message: seen.set() if message.topic == f"{RECORD}/agent" else None

@@ -22,6 +22,7 @@ from iort_agent.ros import ros1_master, ros1_node
 from iort_agent.ros.json_message import Writer, decode, encode
 from iort_contract.limits import MessageError
 from iort_contract.ros.definition import parse
+from testkit.waiting import GUARD_S
 from tests.rosbridge_json import as_rosbridge
 from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, RULE, T0
 from tests.unit.contract.ros.ros_values import by_rosbags, definitions, values
@@ -224,7 +225,7 @@ class Rospy:
     def requestTopic(self, *asked: Any) -> tuple[int, str, list[Any]]:  # noqa: N802 - ROS' name
         assert asked == ("/iort_agent", TOPIC, [["TCPROS"]])
         self.asked.release()
-        assert self.answer.acquire(timeout=60)
+        assert self.answer.acquire(timeout=GUARD_S)
         return 1, "", CHOSEN
 
 
@@ -245,7 +246,7 @@ def rospy(monkeypatch: pytest.MonkeyPatch) -> Rospy:
 def test_two_attempts_at_once_make_one_connection(rospy: Any) -> None:
     first = threading.Thread(target=rospy.connect)
     first.start()
-    assert rospy.asked.acquire(timeout=60)
+    assert rospy.asked.acquire(timeout=GUARD_S)
     # The second begins while the first waits for its answer.
     rospy.connect()
     rospy.answer.release()

@@ -18,7 +18,7 @@ from iort_agent.ros.ros2_session import LOST
 from iort_agent.ros.ros2_topic import Topic
 from iort_agent.sources.intake import Intake, TopicConfig
 from testkit.agent import ManualClock
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 from tests.unit.agent.ros2_graph import BEST_EFFORT, LATCHED, RELIABLE, FakeGraph, FakeTypes
 
 IMU, IMAGE, LOST_TYPE = "a_msgs/msg/Imu", "a_msgs/msg/Image", "b_msgs/msg/Lost"
@@ -447,14 +447,14 @@ def test_a_stop_is_published_while_a_handler_holds_the_reading_thread(node: Node
 
     def take(_header: Mapping[str, str], _data: bytes) -> None:
         held.set()
-        freed.append(free.wait(60))
+        freed.append(free.wait(GUARD_S))
 
     node.advertise("/cmd", IMU)
     node.subscribe("/t", take)
     publisher = graph.publisher("/t", IMU)
     soon(lambda: node.connections("/t") == 1)
     publisher.publish(CDR)
-    assert held.wait(60)
+    assert held.wait(GUARD_S)
     assert node.publish("/cmd", CDR)
     free.set()
     soon(lambda: freed)

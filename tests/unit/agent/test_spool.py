@@ -21,6 +21,7 @@ from iort_agent.spool import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW, Entry,
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.sqlite import RETRY_S, SqliteSpool, make_spool
 from testkit.agent import ManualClock
+from testkit.waiting import GUARD_S
 from tests.examples import examples
 
 ROOT = Path(__file__).parents[3]
@@ -397,7 +398,7 @@ def test_acknowledgements_and_puts_are_written_in_groups(path: Path) -> None:
     spool.on_stored(stored.set)
     spool.start()
     fill(spool, 100)
-    assert stored.wait(60)
+    assert stored.wait(GUARD_S)
     spool.close()
     assert sum(commits) == 100
     assert len(commits) < 10

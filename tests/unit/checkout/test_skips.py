@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from stacks.settings import ROOT
+from testkit.waiting import GUARD_S
 
 MODULES = {
     "test_skips.py": """
@@ -63,7 +64,7 @@ def test_a_skip_is_a_failure_with_require_all(tmp_path, require, code, counts):
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=GUARD_S,
     )
     assert done.returncode == code, done.stdout
     for count in counts:

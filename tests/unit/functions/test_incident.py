@@ -35,6 +35,7 @@ from iort_contract.webhook import (
     webhook_parameter,
 )
 from testkit.dynamodb import ROBOTS
+from testkit.waiting import GUARD_S
 from tests.unit.functions.summarizing import Stream, batch
 
 NOW_S, T_US = 1_700_000_000, 1_700_000_000_000_000
@@ -332,7 +333,7 @@ def test_a_receiver_that_drips_its_answer_has_one_deadline_for_all_of_it(aws, so
         webhook.stored()
         with pytest.raises(WebhookError, match=r"did not answer within 0\.5 s"):
             webhook.deliver(b"{}", "x", tries=1)
-        assert hung_up.wait(30), "the connection stays open"
+        assert hung_up.wait(GUARD_S), "the connection stays open"
     finally:
         server.shutdown()
         server.server_close()

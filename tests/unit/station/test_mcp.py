@@ -16,6 +16,7 @@ from iort_contract.messages.batch import Batch
 from iort_station.errors import StationError
 from iort_station.mcp import AT_ONCE, MOST_LINE_BYTES, WAITING, documents, server
 from local.deployment import ROOT
+from testkit.waiting import GUARD_S
 from tests.unit.station.data.test_queries import START, FakeCloud, cloud_of, ride
 from tests.unit.station.test_inquiries import iso
 
@@ -150,7 +151,7 @@ def test_a_flood_of_a_thousand_questions_is_answered_or_refused_and_harms_nobody
         async with anyio.create_task_group() as tasks:
             for _ in range(1000):
                 tasks.start_soon(ask, client)
-            with anyio.fail_after(120):
+            with anyio.fail_after(GUARD_S):
                 while len(answers) < 1000 - AT_ONCE - WAITING or cloud.inside < AT_ONCE:
                     await anyio.lowlevel.checkpoint()
             assert all(answer.is_error for answer in answers)
@@ -226,7 +227,7 @@ def test_lines_that_are_no_messages_get_an_error_and_the_next_one_its_answer(pro
     answer = send(json.dumps({"jsonrpc": "2.0", "id": 2, "method": "tools/call", "params": call}).encode())
     assert answer["result"]["structuredContent"]["robots"][0]["robot"] == {"robot_text": "car"}
     process.stdin.close()
-    assert process.wait(timeout=30) == 0
+    assert process.wait(GUARD_S) == 0
 
 
 def test_the_sdks_client_starts_the_server_and_asks():

@@ -20,6 +20,7 @@ from iort_station.page import incidents as page
 from iort_station.page import insights
 from iort_station.page.answers import answers, downloads, keyed_actions
 from testkit.dynamodb import FILES
+from testkit.waiting import GUARD_S
 from tests.unit.station.fleet.test_recorder import START, Lab, S
 
 CONTENT = b"messages"
@@ -79,7 +80,7 @@ class Held:
     def query(self, **given):
         self.asked += 1
         self.begun.set()
-        assert self.may.wait(30)
+        assert self.may.wait(GUARD_S)
         return self._query(**given)
 
 
@@ -111,7 +112,7 @@ def test_who_asks_while_they_are_counted_gets_the_last_ones(lab):
     now[0] = page.COUNTED_S
     with ThreadPoolExecutor(1) as reader:
         reading = reader.submit(counts.answer)
-        assert held.begun.wait(30)
+        assert held.begun.wait(GUARD_S)
         assert counts.answer() == {"counts": {}}
         held.may.set()
         assert reading.result() == {"counts": {"car": 1}}

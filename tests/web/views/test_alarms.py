@@ -50,6 +50,11 @@ def test_every_view_counts_the_alarms_and_each_says_what_to_do(open_page, lab, s
     assert page.locator("#acknowledge-as").input_value() == "grace"
 
 
+# The words of each raised alarm about cars.
+RAISED = """() => Object.fromEntries([...document.querySelectorAll("[data-alarm]")]
+  .map((node) => [node.dataset.alarm, node.querySelector("li")?.innerText ?? ""]))"""
+
+
 def test_live_values_raise_the_alarms_of_cars(open_page, lab, server, car):
     lab.alarms = [{**one, "state": "OK"} for one in lab.alarms]
     page = open_page(f"{server.url}#/alarms")
@@ -57,15 +62,15 @@ def test_live_values_raise_the_alarms_of_cars(open_page, lab, server, car):
     assert page.locator("#alarms").is_hidden()
     # The threshold is the deployment's.
     bad = {**SAMPLE, "fault_code": 2, "temperature_pcb": 80.5, "voltage_input": 10.6}
-    show(page, car.send(bad))
-    until(lambda: page.inner_text("#alarms") == "2", "the badge")
-    raised = page.locator("[data-alarm]")
-    assert {raised.nth(i).get_attribute("data-alarm") for i in range(2)} == {
-        "FaultSamples",
-        "TemperatureDegC",
-    }
-    words = page.inner_text("[data-alarm=FaultSamples] li").split("\n")
-    assert words[:2] == ["car-1", "under voltage (2)"]
+
+    def raised():
+        # A car that is gone raises nothing: on a busy machine it sends again.
+        show(page, car.send(bad))
+        words = page.evaluate(RAISED)
+        both = set(words) == {"FaultSamples", "TemperatureDegC"} and page.inner_text("#alarms") == "2"
+        return words["FaultSamples"].split("\n") if both else None
+
+    assert until(raised, "the car's alarms")[:2] == ["car-1", "under voltage (2)"]
     # Without an answer nobody knows.
     lab.refuses = True
     page.reload()

@@ -227,15 +227,32 @@ def test_two_fingers_pan_and_pinch(open_page, server):
     assert value.evaluate("(td) => td.scrollWidth <= td.clientWidth")
 
 
+# The slider's moves: when each was, and to which share of the range, both in seconds.
+MOVES = """(seconds) => {
+  const slider = document.querySelector(".scrub");
+  window.moves = [];
+  const note = () => moves.push([performance.now() / 1000, seconds * slider.value / slider.max]);
+  new MutationObserver(note).observe(slider, { attributeFilter: ["aria-valuetext"] });
+}"""
+
+
 def test_the_playback_is_as_fast_as_chosen(page):
     page.get_by_label("Speed of the playback").select_option("16")
     scrub = page.locator(".scrub")
-    scrub.focus()
-    page.keyboard.press("Home")
-    began = page.evaluate("performance.now()")
-    page.get_by_role("button", name="Play").click()
-    until(lambda: scrub.evaluate("(slider) => slider.value === slider.max"), "the end")
-    assert 1.5 < (page.evaluate("performance.now()") - began) / 1000 < SECOND_S
+    page.evaluate(MOVES, SECOND_S)
+
+    def speed():
+        scrub.focus()
+        page.keyboard.press("Home")
+        page.evaluate("moves.length = 0")
+        page.get_by_role("button", name="Play").click()
+        until(lambda: scrub.evaluate("(slider) => slider.value === slider.max"), "the end")
+        # The end is no whole step, and a busy machine makes few of them.
+        steps = page.evaluate("moves.slice(0, -1)")
+        (began_s, first_s), *_, (ended_s, last_s) = [[0, 0], *steps, [0, 0]] if len(steps) < 2 else steps
+        return (last_s - first_s) / (ended_s - began_s) if ended_s > began_s else 0
+
+    assert until(speed, "a playback in steps") == pytest.approx(16, rel=0.2)
     assert page.get_by_role("button", name="Play").is_visible()
 
 

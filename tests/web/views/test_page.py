@@ -257,23 +257,29 @@ def test_a_fault_is_highlighted_by_name_and_logged(page, car, url):
 
 def test_old_values_look_stale_and_a_silent_car_disappears(page, car):
     show(page, car.send())
-    # The values shown before, and how long the car had been silent then.
+    # The states shown, and how long the car had been silent then.
     page.evaluate(
         """() => {
           const car = document.querySelector("#car");
           window.states = [];
           const note = () => states.push([car.dataset.state, iort.robots["car-1"].silent_s]);
-          note();
           new MutationObserver(note).observe(car, { attributeFilter: ["data-state"] });
         }"""
     )
-    until(lambda: page.get_attribute("#car", "data-state") == "gone", "gone")
+
+    def shown_in_turn():
+        # A busy machine may not look at the car while it is stale.
+        sends_until_live(page, car)
+        page.evaluate("states.length = 0")
+        until(lambda: page.get_attribute("#car", "data-state") == "gone", "gone")
+        told = page.evaluate("states")
+        return told if [state for state, _ in told] == ["stale", "gone"] else None
+
+    states = until(shown_in_turn, "a car that is stale, and then gone")
     bounds = page.evaluate("iort.bounds")
     assert bounds["gone_s"] + bounds["tick_s"] <= 5
-    states = page.evaluate("states")
-    assert [state for state, _ in states if state != "live"] == ["stale", "gone"]
     for state, silent_s in states:
-        least = {"live": 0, "stale": bounds["stale_s"] - 0.1, "gone": bounds["gone_s"]}[state]
+        least = {"stale": bounds["stale_s"] - 0.1, "gone": bounds["gone_s"]}[state]
         assert silent_s >= least
     assert "last heard" in page.inner_text(".car-state")
     assert shown(page, "voltage_input") == "11.65"
@@ -293,7 +299,7 @@ def sends_until_live(page, car):
 def test_a_sample_with_a_long_delay_is_stale(page, car):
     first = car.send()
     show(page, first)
-    until(lambda: page.evaluate("iort.robots['car-1'].state") == "stale", "silence")
+    until(lambda: page.evaluate("iort.robots['car-1'].state") in {"stale", "gone"}, "silence")
     late = car.update()
     late["t"] = first["t"] + 1000
     car.publish(late)

@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip("aiortc", reason="aiortc is not installed")
 
+import re
 from dataclasses import asdict
 
 from iort_contract.counter import read_counter
@@ -119,7 +120,16 @@ def motions(camera):
 
 
 def moves(camera):
-    return motions(camera)[-1]["message"]["drive"]["speed"] > 0
+    return any(command["message"]["drive"]["speed"] > 0 for command in motions(camera)[-1:])
+
+
+def looked_at(camera, by_webrtc, over_broker):
+    """Wait until so many look: on a busy machine small pictures may come first, and end a moment later."""
+    until(lambda: camera.viewers == (by_webrtc, over_broker), "those who look")
+
+
+def offers(broker):
+    return [look["kind"] for look in broker.sent("/video")].count("offer")
 
 
 def test_the_picture_is_shown_with_its_age_and_only_while_somebody_looks(
@@ -136,15 +146,15 @@ def test_the_picture_is_shown_with_its_age_and_only_while_somebody_looks(
     line = page.locator(".sight-line")
     until(lambda: "pictures/s" in line.inner_text(), "the figures")
     assert line.inner_text().startswith(f"WebRTC: {TERMS.width} \u00d7 {TERMS.height}, ")
-    assert camera.viewers == (1, 0)
+    looked_at(camera, 1, 0)
     page.get_by_role("button", name="Stop looking").click()
-    until(lambda: camera.viewers == (0, 0), "nobody to look")
+    looked_at(camera, 0, 0)
     assert page.locator(".sight-frame").is_hidden()
     # Another view ends it, too.
     look(page)
     sight(page, state="live")
     page.goto(f"{server.url}#/alarms")
-    until(lambda: camera.viewers == (0, 0), "the view to be left")
+    looked_at(camera, 0, 0)
 
 
 def test_a_car_without_a_camera_has_no_panel(open_page, lab, server, car):
@@ -195,9 +205,8 @@ def test_a_late_picture_ends_driving_though_it_moves(open_page, server, car, cam
     sight(page, state="late")
     assert page.evaluate(EDGE) == "rgb(255, 196, 0)"
     phase(page, "over")
-    words = page.inner_text(".sight-words")
-    assert words.startswith("Late, 20")
-    assert words.endswith(f" ms old, at most {TERMS.max_age_ms} ms: driving has ended")
+    late = rf"Late, 2\d\D?\d\d\d ms old, at most {TERMS.max_age_ms} ms: driving has ended"
+    assert re.fullmatch(late, page.inner_text(".sight-words"))
 
 
 def test_a_hidden_tab_shows_nothing_and_drives_nothing(open_page, server, car, camera):
@@ -205,7 +214,7 @@ def test_a_hidden_tab_shows_nothing_and_drives_nothing(open_page, server, car, c
     take_the_wheel(page)
     drive(page)
     page.evaluate(HIDE, True)
-    until(lambda: camera.viewers == (0, 0), "the hidden page to look at nothing")
+    looked_at(camera, 0, 0)
     until(lambda: camera.commands[-1].get("ends"), "the lease to be given up")
     sent = len(motions(camera))
     page.evaluate(HIDE, False)
@@ -235,7 +244,7 @@ def test_without_webrtc_small_pictures_come_over_the_broker_and_it_is_tried_agai
     camera.sees.set()
     camera.change = lambda show: show
     sight(page, state="live", way="webrtc")
-    until(lambda: camera.viewers == (1, 0), "the small pictures to end")
+    looked_at(camera, 1, 0)
 
 
 def test_who_drives_blind_says_so_with_every_command_and_never_by_a_choice_that_is_kept(
@@ -312,7 +321,7 @@ def test_a_phone_drives_on_the_whole_screen(open_page, server, car, camera, scri
     fingers.put(2, middle(page, ".stick")[0], 0)
     button = middle(page, ".deadman")
     press, release = lambda: fingers.put(1, *button), lambda: fingers.lift(1)
-    hold(page, press, release, lambda: camera.commands and moves(camera), "the finger to move the car")
+    hold(page, press, release, lambda: moves(camera), "the finger to move the car")
     fingers.lift(2)
     fingers.lift(1)
     until(lambda: not held(page), "the finger to let go")
@@ -338,7 +347,7 @@ def test_replayed_and_garbled_messages_change_nothing(open_page, server, car, br
     page = open_car(open_page, f"{server.url}#/car/car-1", car)
     look(page)
     sight(page, state="live", way="webrtc")
-    answered = list(camera.answers)
+    answered, offered = list(camera.answers), offers(broker)
     topics = {topic for topic, _ in answered}
     for topic, payload in answered:
         broker.publish(topic, payload)
@@ -349,8 +358,8 @@ def test_replayed_and_garbled_messages_change_nothing(open_page, server, car, br
     number = int(page.get_attribute(".sight", "data-frame") or 0)
     until(lambda: int(page.get_attribute(".sight", "data-frame") or 0) > number + 20, "newer pictures")
     assert page.get_attribute(".sight", "data-way") == "webrtc"
-    assert len([look for look in broker.sent("/video") if look["kind"] == "offer"]) == 1
-    assert camera.viewers == (1, 0)
+    assert offers(broker) == offered
+    looked_at(camera, 1, 0)
 
 
 def test_the_picture_outlives_a_lost_connection_to_the_broker(open_page, server, car, broker, camera):
@@ -363,7 +372,7 @@ def test_the_picture_outlives_a_lost_connection_to_the_broker(open_page, server,
         lambda: "keep" in [look["kind"] for look in broker.sent("/video")[asked:]], "the lease to be renewed"
     )
     assert page.get_attribute(".sight", "data-way") == "webrtc"
-    assert camera.viewers == (1, 0)
+    looked_at(camera, 1, 0)
 
 
 def test_a_picture_that_the_browser_pauses_goes_on_beside_another_viewers(
@@ -373,15 +382,16 @@ def test_a_picture_that_the_browser_pauses_goes_on_beside_another_viewers(
     for each in (page, other):
         look(each)
         sight(each, state="live", way="webrtc")
-    assert camera.viewers == (2, 0)
+    looked_at(camera, 2, 0)
+    offered = offers(broker)
     # As one that saves power does.
     page.evaluate("document.querySelector('.sight video').pause()")
     number = int(page.get_attribute(".sight", "data-frame") or 0)
     until(lambda: int(page.get_attribute(".sight", "data-frame") or 0) > number + 5, "newer pictures")
     assert page.get_attribute(".sight", "data-way") == "webrtc"
-    assert [look["kind"] for look in broker.sent("/video")].count("offer") == 2
+    assert offers(broker) == offered
     other.get_by_role("button", name="Stop looking").click()
-    until(lambda: camera.viewers == (1, 0), "one to look on")
+    looked_at(camera, 1, 0)
     sight(page, state="live")
 
 

@@ -49,6 +49,16 @@ def lab():
     lab.stops.set()
 
 
+# What is said between two presses.
+PRESS_TWICE = """() => {
+  const press = document.querySelector(".stop-press");
+  press.click();
+  const said = document.querySelector(".stop-sent").innerText;
+  press.click();
+  return said;
+}"""
+
+
 @pytest.mark.parametrize("tabs", [1, 3])
 def test_a_stop_passes_every_answer_that_the_tabs_of_a_browser_wait_for(open_page, lab, server, tabs):
     page = open_page(server.invitation())
@@ -75,9 +85,8 @@ def test_a_press_is_shown_at_once_and_what_to_do_without_an_answer(open_page, la
     sent = page.locator(".stop-sent")
     press = page.get_by_role("button", name="Stop car-1")
     lab.past.set()
-    press.click()
-    assert sent.inner_text() == "Stop sent to car-1 …"
-    press.click()
+    # Twice within a second, also on a busy machine.
+    assert page.evaluate(PRESS_TWICE) == "Stop sent to car-1 …"
     late = "No answer after 1.0 s: car-1 may not have"
     until(lambda: sent.inner_text().startswith(late), "the end of a second")
     for advice in ("Press again, and use the switch on the car.", "within 0.5 s of the last one"):

@@ -27,6 +27,7 @@ from iort_contract.limits import MessageError, Value
 from iort_contract.messages.commands import Command, encode_command
 from iort_contract.ros.definition import Definition, layout, parse
 from testkit.agent import Loopback, ManualClock, link_of
+from testkit.waiting import GUARD_S
 
 RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
@@ -134,7 +135,7 @@ class FakeGraph:
     def await_published(self, count: int) -> None:
         """Wait for so many messages."""
         with self._news:
-            assert self._news.wait_for(lambda: len(self.published) >= count, 30), self.published
+            assert self._news.wait_for(lambda: len(self.published) >= count, GUARD_S), self.published
 
     def offer(self, service: str, handler: OnTrigger) -> None:
         self.services[service] = handler

@@ -23,6 +23,7 @@ from iort_agent.control.leases import STOP_AHEAD_MS
 from iort_contract.messages.commands import NO_GUARD
 from iort_contract.ros.definition import parse
 from testkit.agent import ManualClock
+from testkit.waiting import GUARD_S
 from tests.unit.agent.control.downlink_rig import LEASE_MS, T0, FakeGuard, Rig, doubles
 
 pytestmark = pytest.mark.usefixtures("ros")
@@ -45,7 +46,7 @@ def test_a_guard_that_died_and_cannot_be_started_refuses_motion_until_it_can(
     clock = ManualClock()
     guard = Guard("guard", {}, clock)
     guard.start()
-    assert select.select([started[0].stdout], [], [], 30)[0]
+    assert select.select([started[0].stdout], [], [], GUARD_S)[0]
     assert guard.ready()
     monkeypatch.setenv("NO_PROCESS", "1")
     started[0].kill()
@@ -57,7 +58,7 @@ def test_a_guard_that_died_and_cannot_be_started_refuses_motion_until_it_can(
         clock.advance(2)
     monkeypatch.delenv("NO_PROCESS")
     guard.tick()
-    assert select.select([started[1].stdout], [], [], 30)[0]
+    assert select.select([started[1].stdout], [], [], GUARD_S)[0]
     assert guard.ready()
     guard.close()
 

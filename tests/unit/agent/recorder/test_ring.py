@@ -25,6 +25,7 @@ from iort_agent.sources.intake import Selected
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.ros.message import MessageType, RosMessage, RosType
 from testkit.agent import ManualClock
+from testkit.waiting import GUARD_S
 
 S = 1_000_000
 T0 = 1_700_000_000_000_000
@@ -559,7 +560,7 @@ def test_the_thread_writes_and_a_reader_may_wait_for_it(tmp_path: Path) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert ring.flush(30)
+    assert ring.flush(GUARD_S)
     messages = list(ring.read(0, 2**62))
     assert sorted(message.seq for message in messages) == list(range(2000))
     assert sum(segment.closed for segment in ring.segments(0, 2**62)) == 0

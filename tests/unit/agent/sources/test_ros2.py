@@ -27,7 +27,7 @@ from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.ros.message import RosMessage, message_type
 from iort_contract.topics import matches, stream_of
 from testkit.agent import ManualClock
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 from tests.unit.agent.ros2_graph import LATCHED, RELIABLE, FakeGraph, FakeTypes
 
 FLOAT, STAMPED = "a_msgs/msg/Float", "a_msgs/msg/Stamped"
@@ -90,7 +90,7 @@ class Running(Ros2Source):
 
     def end(self) -> None:
         self._over.set()
-        self._thread.join(10)
+        self._thread.join(GUARD_S)
 
 
 @pytest.fixture

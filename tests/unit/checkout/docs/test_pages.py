@@ -19,6 +19,7 @@ from iort_agent.config import load_config
 from iort_station.cli.main import app
 from scripts import docs_parts
 from scripts.docs_parts import ROOT
+from testkit.waiting import GUARD_S
 from tests.manual import COMMANDS, examples
 from tests.manual import parse as verb
 
@@ -167,5 +168,5 @@ def test_a_command_explains_each_option_and_has_examples_that_call_it(name: str)
 def test_the_completion_knows_the_commands() -> None:
     iort = Path(sys.executable).parent / "iort"
     words = {"_IORT_COMPLETE": "complete_bash", "COMP_WORDS": "iort qu", "COMP_CWORD": "1"}
-    done = subprocess.run([iort], env=words, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run([iort], env=words, capture_output=True, text=True, check=False, timeout=GUARD_S)
     assert done.stdout.split() == ["query"], done.stderr

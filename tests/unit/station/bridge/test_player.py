@@ -119,7 +119,7 @@ def test_a_seek_cancels_what_is_read_and_of_several_the_last_one_counts() -> Non
     audience, source = Audience(0), Ticks(600, hold=hold)
     with Player(source, audience) as player:
         control(player, Request(play=True))
-        assert waits.wait(60)
+        assert waits.wait(GUARD_S)
         # The reader stands in the middle of a page.
         for second in (100, 200, 300, 590):
             state = control(player, Request(play=True, seek_ns=second * SECOND, name=str(second)))

@@ -14,6 +14,7 @@ from iort_station.cli import options, verbs
 from iort_station.cli.main import app, main
 from iort_station.cli.verbs import VERBS, Verb
 from iort_station.errors import UsageError
+from testkit.waiting import GUARD_S
 
 # Each takes longer to import than `iort --help` may take.
 HEAVY = {
@@ -41,7 +42,11 @@ finally:
 def loaded(*arguments):
     """The modules that a command has imported at its end."""
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", PROGRAM, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=GUARD_S,
+        check=True,
     )
     return set(json.loads(done.stderr.splitlines()[-1]))
 
@@ -66,7 +71,7 @@ for name in ("audit", "export", "laps", "plot", "query", "runs", "streams"):
 print(*sorted(sys.modules))
 """
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=GUARD_S, check=True
     )
     assert not set(done.stdout.split()) & {"boto3", "botocore.session", "numpy", "pyarrow"}
 

@@ -21,6 +21,7 @@ from iort_station.errors import StationError
 from iort_station.upkeep import backup
 from iort_station.upkeep.backup import back_up, restore, verify
 from iort_station.upkeep.snapshot import held
+from testkit.waiting import GUARD_S
 
 # As the cloud does it: a file is whole before the ledger names it.
 WRITER = """
@@ -98,7 +99,7 @@ def test_the_next_backup_removes_what_a_killed_one_has_left(state: Path, tmp_pat
         "back_up(Path(sys.argv[1]), Path(sys.argv[2]), progress=kill)"
     )
     archive = backups / "cloud.tar"
-    subprocess.run([sys.executable, "-c", code, str(state), str(archive)], check=False, timeout=60)
+    subprocess.run([sys.executable, "-c", code, str(state), str(archive)], check=False, timeout=GUARD_S)
     assert len(list(backups.iterdir())) == 2
     # One that another process is writing, and a file of somebody's.
     others = {backups / ".cloud.tar.1.part", backups / ".cloud.tar.notes"}
