@@ -38,7 +38,7 @@ class Running:
         """Wait for a number of samples, in total or from now on."""
         with self._more:
             wanted = count + (len(self.samples) if more else 0)
-            assert self._more.wait_for(lambda: len(self.samples) >= wanted, 60), len(self.samples)
+            assert self._more.wait_for(lambda: len(self.samples) >= wanted, GUARD_S), len(self.samples)
 
     def _run(self) -> None:
         try:

@@ -247,7 +247,8 @@ def test_a_slow_topic_keeps_its_subscription(server: RosbridgeStandin) -> None:
         while time.monotonic() - began < 1.0:
             server.publish("/fast", {"n": time.monotonic()})
             time.sleep(0.05)  # the pace of a publisher
-    assert [op["op"] for op in server.operations if op["op"] == "unsubscribe"] == []
+    # A busy machine may be too slow a publisher of the other.
+    assert [op for op in server.operations if op["op"] == "unsubscribe" and op["topic"] == "/slow"] == []
     assert "resubscribed" not in running.source.report()["/slow"]
 
 

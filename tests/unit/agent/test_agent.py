@@ -412,8 +412,8 @@ def test_lanes_fields_and_rates_change_while_it_runs() -> None:
 
     rig = Rig(tuned)
     began = rig.clock.monotonic()
-    assert rig.runtime.run(drain_s=10) == 0
-    assert rig.clock.monotonic() - began < 10, "it waited for something that does not come"
+    assert rig.runtime.run(drain_s=2 * GUARD_S) == 0
+    assert rig.clock.monotonic() - began < GUARD_S, "it waited for something that does not come"
     assert rig.recorded() == [1, 2, 4]
     assert [sorted(batch.columns) for batch in rig.batches("vesc")] == [
         ["speed", "voltage_input"], ["speed"], ["speed", "voltage_input"],
