@@ -71,7 +71,7 @@ class Machine:
         kind: socket.SocketKind = socket.SOCK_STREAM,
         *,
         family: socket.AddressFamily = socket.AF_INET,
-        bind: tuple[str, int] | None = None,
+        bind: tuple[str | int, int] | None = None,
         listen: bool = False,
     ) -> socket.socket:
         """A socket of this machine's network, in our hands. Raises `InstrumentError`."""

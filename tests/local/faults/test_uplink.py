@@ -5,12 +5,16 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import socket
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from iort_agent.common.threads import SystemClock
 from iort_agent.mqtt import aws, dispatch
@@ -22,8 +26,12 @@ from iort_contract.topics import BROKER, CMD, PING, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from testkit.mqtt import Robot
+from testkit.namespaces import NoNamespacesError, machines
 from testkit.proxy import FREEZE, PASS, REFUSE, Proxy
 from testkit.waiting import until
+
+# linux/rtnetlink.h: notices of IPv4 addresses.
+RTMGRP_IPV4_IFADDR = 0x10
 
 
 class UplinkLog:
@@ -118,6 +126,24 @@ def test_a_network_that_comes_back_ends_the_wait(bundle, proxy):
         proxy.reset()
         until(lambda: log.connections == [True, False])
         wifi.back.set()
+        log.echo(b"after")
+
+
+def test_a_network_of_which_the_kernel_tells_ends_the_wait(bundle, proxy, tmp_path):
+    """The notices are those of another machine's kernel, which gets an address when the test says so."""
+    with ExitStack() as stack:
+        try:
+            (robot,) = stack.enter_context(machines(tmp_path, "robot"))
+        except NoNamespacesError as error:
+            pytest.skip(str(error))
+        notices = robot.socket(socket.SOCK_RAW, family=socket.AF_NETLINK, bind=(0, RTMGRP_IPV4_IFADDR))
+        notices.setblocking(False)
+        network = partial(Network, notices)
+        log = stack.enter_context(connecting(bundle(), proxy, backoff=Endless(), network=network))
+        log.echo(b"before")
+        proxy.reset()
+        until(lambda: log.connections == [True, False])
+        robot.run("ip", "address", "add", "10.77.0.1/24", "dev", "lo")
         log.echo(b"after")
 
 
