@@ -300,7 +300,7 @@ def test_a_registered_certificate_keeps_the_name(robots, iot, caplog):
         ({"serial": "s2"}, {}),
         ({}, {ADMIT_UNTIL_S: 1}),
         # AWS IoT may still be registering it.
-        ({}, {ADMITTED_MS: time.time_ns() // 1_000_000 + 3_600_000}),
+        ({}, {ADMITTED_MS: LATER_S * 1000}),
     ],
 )
 def test_a_request_of_another_robot_asks_aws_iot_nothing(robots, iot, monkeypatch, asked, changed):

@@ -9,7 +9,7 @@ from iort_contract.catalog.streams import LOG_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from local.deployment import ROOT
 from testkit.waiting import until
-from tests.browser import drawn, plain, show, shown
+from tests.browser import plain, show, shown
 from tests.web.cars import GAIN, SAMPLE, Car
 from tests.web.lab import VIEWS, past
 
@@ -83,14 +83,16 @@ def test_ros_standard_messages_have_their_units(page, car):
 
 def test_the_page_counts_faulty_cars(page, car):
     cars = [Car(car.pubnub, name) for name in ("a", "b", "c")]
-    for each, code in zip(cars, (5, 0, 3), strict=True):
-        show(page, each.send({**SAMPLE, "fault_code": code}))
-    until(lambda: page.inner_text("#faulty") == "2 with a fault", "the count")
-    show(page, cars[0].send({**SAMPLE, "fault_code": 0}))
-    until(lambda: page.inner_text("#faulty") == "1 with a fault", "the lower count")
-    show(page, cars[2].send({**SAMPLE, "fault_code": 0}))
-    drawn(page)
-    until(lambda: page.inner_text("#faulty") == "", "none")
+
+    def counted(*codes):
+        # One that is gone does not count: on a busy machine all send again.
+        sent = [each.send({**SAMPLE, "fault_code": code}) for each, code in zip(cars, codes, strict=True)]
+        for update in sent:
+            show(page, update)
+        return page.inner_text("#faulty")
+
+    for codes, words in (((5, 0, 3), "2 with a fault"), ((0, 0, 3), "1 with a fault"), ((0, 0, 0), "")):
+        until(lambda codes=codes, words=words: counted(*codes) == words, words or "no fault")
 
 
 def luminance(colour):
