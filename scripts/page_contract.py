@@ -76,7 +76,6 @@ def _constants() -> Iterator[str]:
         limits: (
             "SCHEMA_VERSION",
             "MAX_FIELDS",
-            "MAX_FIELD_CHARACTERS",
             "MAX_NEXT_MS",
             "STALE_S",
             "GONE_S",
@@ -118,7 +117,6 @@ def _constants() -> Iterator[str]:
             value = getattr(module, name)
             literal = f"/^(?:{value.pattern})$/" if isinstance(value, re.Pattern) else json.dumps(value)
             yield f"export const {name} = {literal};"
-    yield f"export const POSE_STREAM = {json.dumps(POSE_STREAM)};"
     yield f"export const LOG_STREAM = {json.dumps(LOG_STREAM)};"
     yield f"export const DRIVE_STREAM = {json.dumps(DRIVE_STREAM)};"
     yield f"export const INCIDENT_STREAM = {json.dumps(INCIDENT_STREAM)};"

@@ -2,7 +2,6 @@
 // [[[cog page_contract() ]]]
 export const SCHEMA_VERSION = 1;
 export const MAX_FIELDS = 512;
-export const MAX_FIELD_CHARACTERS = 1024;
 export const MAX_NEXT_MS = 100000;
 export const STALE_S = 1.5;
 export const GONE_S = 4.5;
@@ -41,7 +40,6 @@ export const PICTURE = "picture";
 export const TO = "to-";
 export const KEY_HEADER = "X-Iort-Key";
 export const INVITATION = "key";
-export const POSE_STREAM = "pose";
 export const LOG_STREAM = "log";
 export const DRIVE_STREAM = "drive";
 export const INCIDENT_STREAM = "incidents";
