@@ -15,9 +15,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import av
 
@@ -186,15 +187,25 @@ def _ffmpeg(program: str, codec: str, rate_hz: int) -> Callable[[Path, int], lis
 
 
 def _pyav(codec: str, rate_hz: int) -> Callable[[Path, int], list[str]]:
-    return lambda raw, count: [
-        sys.executable,
-        "-m",
-        "bench.floors.pyav_encode",
-        codec,
-        str(rate_hz),
-        str(count),
-        str(raw),
-    ]
+    program = [sys.executable, "-m", "bench.sections.video", codec, str(rate_hz)]
+    return lambda raw, count: [*program, str(count), str(raw)]
+
+
+def encode(codec: str, rate_hz: int, count: int, raw: Path) -> None:
+    """Encode raw pictures by PyAV in a plain loop, and write nothing: the floor where ffmpeg is missing."""
+    context: Any = av.CodecContext.create(LIBRARIES[codec], "w")
+    context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+    context.time_base, context.framerate = Fraction(1, rate_hz), Fraction(rate_hz)
+    context.bit_rate, context.gop_size, context.thread_count = KBPS * 1000, 1_000_000, 1
+    context.options = options(codec, KBPS * 1000)
+    parts = WIDTH * HEIGHT, WIDTH * HEIGHT // 4, WIDTH * HEIGHT // 4
+    with raw.open("rb") as pictures:
+        for i in range(count):
+            picture = av.VideoFrame(WIDTH, HEIGHT, "yuv420p")
+            for plane, size in zip(picture.planes, parts, strict=True):
+                plane.update(pictures.read(size))
+            picture.pts = i
+            context.encode(picture)
 
 
 def _child_s(command: list[str]) -> float:
@@ -220,3 +231,6 @@ SECTION = Declared(
     Report("video", "The processor for video", "make bench ONLY=video"),
     cloud=False,
 )
+
+if __name__ == "__main__":
+    encode(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4]))

@@ -185,9 +185,3 @@ def write_table(table: Table) -> bytes:
     file = io.BytesIO()
     pq.write_table(pa.table(columns), file, compression="zstd")
     return file.getvalue()
-
-
-def read_table(content: bytes) -> dict[str, np.ndarray]:
-    """The columns of a file that `write_table` wrote."""
-    table = pq.read_table(io.BytesIO(content))
-    return {name: table[name].to_numpy() for name in table.column_names}

@@ -244,7 +244,7 @@ def _outcome(outcome: Outcome) -> dict[str, Any]:
 
 def _cost(plans: list[Plan], days: int) -> dict[str, float]:
     """Dollars at list prices: once, and for what is stored."""
-    from iort_station.cost import imports  # noqa: PLC0415 - only for a dry run
+    from iort_station.cost import report  # noqa: PLC0415 - only for a dry run
 
     once = stored = 0.0
     for plan in plans:
@@ -254,13 +254,13 @@ def _cost(plans: list[Plan], days: int) -> dict[str, float]:
         seconds = (plan.last_us - plan.first_us) / 1e6 + 1
         hours = plan.last_us // _HOUR_US - plan.first_us // _HOUR_US + 1
         counts = plan.streams.values()
-        one = imports.Imported(
+        one = report.Imported(
             sum(min(seconds, count) for count in counts),
             sum(min(hours, count) for count in counts),
             plan.size,
         )
-        units = imports.archive_units(one) if plan.store == "archive" else imports.table_units(one, days)
-        more, kept = imports.dollars(units)
+        units = report.archive_units(one) if plan.store == "archive" else report.table_units(one, days)
+        more, kept = report.import_dollars(units)
         once, stored = once + more, stored + kept
     return {"once_usd": round(once, 6), "storage_usd": round(stored, 6)}
 

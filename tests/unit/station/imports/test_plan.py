@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from iort_station.cost.imports import Imported, archive_units, dollars, table_units
+from iort_station.cost.report import Imported, archive_units, import_dollars, table_units
 from iort_station.errors import UsageError
 from iort_station.imports.choice import Choice
 from iort_station.imports.plan import recordings, said_robot
@@ -67,11 +67,11 @@ def test_streams_are_named_as_init_names_them() -> None:
 
 def test_the_archive_costs_less_than_the_table() -> None:
     one = Imported(seconds=5 * 3600.0, stream_hours=5, size=1_000_000_000)
-    table, archive = sum(dollars(table_units(one, 90))), sum(dollars(archive_units(one)))
+    table, archive = sum(import_dollars(table_units(one, 90))), sum(import_dollars(archive_units(one)))
     assert 0 < archive < table
     # Items of 33 KB, each written with its second, and read three times.
     writes, reads = 18_000 * (33 + 1) * 0.705e-6, 3 * 18_000 * 9 * 0.141e-6
-    assert dollars(table_units(one, 90))[0] == pytest.approx(writes + reads, rel=0.01)
+    assert import_dollars(table_units(one, 90))[0] == pytest.approx(writes + reads, rel=0.01)
 
 
 def test_patterns_and_links_are_taken_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
