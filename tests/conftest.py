@@ -25,8 +25,8 @@ settings.load_profile("iort")
 # `make test-fast`; CI generates the usual number. tests/examples.py scales a test's own number with it.
 settings.register_profile("fast", settings.get_profile("iort"), max_examples=10, stateful_step_count=10)
 
-# The test's own name, and the hosts of embedded clouds, which the station adds for its whole process.
-_CHANGING = {"PYTEST_CURRENT_TEST", "no_proxy", "NO_PROXY"}
+# Libraries set names of their own as they load, and the station names its clouds' hosts in no_proxy.
+_OURS = ("AWS_", "HOME", "IORT_", "PATH", "PYTHONPATH", "TMPDIR", "TZ")
 _SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
 
 # Tests that share something costly run in one worker of `make test`: an embedded cloud, the demo, which
@@ -144,7 +144,7 @@ def _process() -> dict[str, object]:
         "logging": (logging.getLogger().level, manager.disable),
         # A logger is as good as none until it is set.
         "loggers": {name: state for name, state in loggers.items() if state != (logging.NOTSET, True, False)},
-        "environment": {name: value for name, value in os.environ.items() if name not in _CHANGING},
+        "environment": {name: value for name, value in os.environ.items() if name.startswith(_OURS)},
         "folder": Path.cwd(),
         "signals": {number: signal.getsignal(number) for number in _SIGNALS},
     }
