@@ -104,9 +104,7 @@ def test_what_came_into_the_bucket_since_is_deleted_and_destroy_goes_on(cdk):
 
 
 @mock_aws
-def test_the_deployments_schedules_alone_are_switched(monkeypatch):
-    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
-    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+def test_the_deployments_schedules_alone_are_switched():
     client = boto3.client("scheduler", region_name="eu-west-1")
     role = "arn:aws:iam::123456789012:role/schedules"
     target = {"Arn": "arn:aws:lambda:eu-west-1:123456789012:function:archive", "RoleArn": role, "Input": "{}"}
