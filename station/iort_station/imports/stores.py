@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from io import SEEK_END
@@ -43,8 +44,8 @@ from iort_contract.archive import (
 )
 from iort_contract.dynamodb import Item, Keys
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import Batch, batch_id
-from iort_contract.objects import CHANGED, Objects, code_of
+from iort_contract.messages.batch import Batch, BatchId, batch_id
+from iort_contract.objects import CHANGED, Objects, Read, code_of
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, SAMPLES, TOPIC
 from iort_contract.topics import parse_topic
 from iort_station.cloud import Cloud
@@ -54,7 +55,8 @@ from iort_station.errors import StationError
 TABLE, ARCHIVE = "table", "archive"
 # The archive's function joins the day's hours and compresses them again.
 _LEVEL = 2
-_ATTEMPTS = 3
+# Each failure means that another one has written the hour: the archive's function, or another import.
+_ATTEMPTS = 10
 # Hours that begin later wait in another temporary file.
 _SCRATCH_BYTES = 256 * 1024 * 1024
 
@@ -189,7 +191,6 @@ class ArchiveStore:
 
     def _write(self, stream: str, hour: Hour, new: _Open) -> None:
         topic = topic_of(self._cloud, self._robot, stream)
-        # The archive's function may write the same hour.
         while not self._is_written(topic, hour, new):
             new.attempts += 1
 
@@ -197,7 +198,8 @@ class ArchiveStore:
         try:
             self._write_once(topic, hour, new)
         except Exception as error:
-            changed = code_of(error) in {*CHANGED, "ConditionalCheckFailedException"}
+            # An hour's object goes when it is joined to its day.
+            changed = code_of(error) in {*CHANGED, "ConditionalCheckFailedException", "NoSuchKey"}
             if not changed or new.attempts >= _ATTEMPTS:
                 raise
             return False
@@ -210,7 +212,9 @@ class ArchiveStore:
         version = self._objects.version(key)
         row = self._row(topic, hour)
         with ExitStack() as files:
-            there = _There(self._objects, row, hour, new.hashes, files)
+            there = _There(
+                self._objects, key if version is not None else "", row, hour, new=new.hashes, files=files
+            )
             if not there.is_newer and new.hashes.keys() <= there.hashes.keys():
                 return
             hashes = {**new.hashes, **there.hashes}
@@ -262,53 +266,56 @@ def _damaged(row: ArchivedHour) -> StationError:
 
 
 class _There:
-    """What the archive has of an hour already: the hashes by the ids of its batches, and its file."""
+    """What the archive has of an hour already: the hashes by the ids of its batches, and its file.
+
+    The hour's object may have more than its row says: an import that runs now, or was killed, has written the
+    object, and not the row. What is written next must have that, too.
+    """
 
     def __init__(
         self,
         objects: Objects,
+        key: str,
         row: ArchivedHour | None,
         hour: Hour,
+        *,
         new: Collection[str],
         files: ExitStack,
     ) -> None:
-        """``new`` are the ids of the import's batches."""
+        """``key`` is that of the hour's object, empty without one; ``new`` are the ids of the import's
+        batches."""
         self._hour = hour
         # Whether it was written after its row.
         self.is_newer = False
         self.hashes: dict[str, str] = {}
+        self._batches: dict[str, str] = {}
         self._file: ArchiveFile | None = None
         if row is not None and row.refused:
             # What was no batch stays in an object of its own.
             lines = files.enter_context(objects.read(refused_key(parse_topic(row.topic), hour)).file)
             self.hashes.update({key_of(item): item_hash(item) for item in map(json.loads, lines)})
-        if row is None or not row.key:
-            return
-        read = objects.read(row.key)
-        file = files.enter_context(read.file)
-        self.is_newer = read.sha256 != row.sha256
-        try:
-            self._file = ArchiveFile(file)
-            self._batches = dict(self._file.hashes(hour))
-        except (ContractError, ValueError, OSError, KeyError) as error:
-            raise _damaged(row) from error
-        self.hashes.update(self._batches)
-        if self.is_newer and not self._follows(row, new):
-            raise _damaged(row)
+        named = "" if row is None else row.key
+        for one in dict.fromkeys((key, named)):
+            if one and self._takes(objects.read(one), row, new, files):
+                return
+            if one and one == named:
+                assert row is not None, "it has a key"
+                raise _damaged(row)
 
-    def _follows(self, row: ArchivedHour, new: Collection[str]) -> bool:
-        """Whether the object has what the row says, and perhaps batches of the import, which was ended before
-        it wrote the row: all of them, or those from some number on, if it wrote the hour several times."""
-        every = sorted(self.hashes.items())
-        boots = {batch_id(one).boot for one in new}
-        own = [one for one in map(batch_id, self._batches) if one.boot in boots]
-        candidates: list[Collection[str]] = [(), new]
-        candidates += [
-            {str(one) for one in own if one.seq >= first} for first in sorted({one.seq for one in own})
-        ]
-        return any(
-            content_hash(one for one in every if one[0] not in added) == row.content for added in candidates
-        )
+    def _takes(self, read: Read, row: ArchivedHour | None, new: Collection[str], files: ExitStack) -> bool:
+        """Take an object as the hour's, if it has what the row says; whether it does."""
+        file = files.enter_context(read.file)
+        try:
+            opened = ArchiveFile(file)
+            batches = dict(opened.hashes(self._hour))
+        except (ContractError, ValueError, OSError, KeyError):
+            return False
+        is_newer = row is None or read.sha256 != row.sha256
+        if is_newer and row is not None and not _follows(row, {**self.hashes, **batches}, batches, new):
+            return False
+        self._file, self._batches, self.is_newer = opened, batches, is_newer
+        self.hashes.update(batches)
+        return True
 
     def beside(self, new: _Open) -> Pieces:
         """The hour's pieces with new ones, in the order of their batches. Those that are there already stay
@@ -335,6 +342,28 @@ class _There:
             kept = [each not in self.hashes for each in ids]
             if any(kept):
                 yield one._replace(table=one.table.filter(pa.array(np.repeat(kept, np.diff(rows)))))
+
+
+def _follows(
+    row: ArchivedHour, hashes: Mapping[str, str], batches: Collection[str], new: Collection[str]
+) -> bool:
+    """Whether an object has what the row says, and perhaps more: the ``new`` batches, and those of one run
+    from some number on, of an import that has written the object, perhaps several times, and not the row."""
+    every, runs_there = sorted(hashes.items()), defaultdict[str, list[BatchId]](list)
+    for one in map(batch_id, batches):
+        runs_there[one.boot].append(one)
+
+    def added() -> Iterator[set[str]]:
+        yield set()
+        for some in runs_there.values():
+            for first in sorted({one.seq for one in some}):
+                yield {str(one) for one in some if one.seq >= first}
+
+    return any(
+        content_hash(one for one in every if one[0] not in more) == row.content
+        for some in added()
+        for more in (some, some.union(new))
+    )
 
 
 def _sorted(some: Pieces) -> Pieces:

@@ -9,9 +9,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -44,7 +46,7 @@ from iort_station.operations import archive, audit
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from testkit.bags import START_NS, STREAMS, TOPICS, speed, voltage, written
-from testkit.waiting import until
+from testkit.waiting import GUARD_S, until
 from tests.local.conftest import invoke
 from tests.recordings import recording
 
@@ -507,6 +509,98 @@ def test_an_import_that_was_killed_before_the_row_goes_on(
         manifest.keep(replace(old, content="0" * 64), manifest.row(new.topic, parse_hour(new.hour)))
     ledger.note(plan.content, replace(note, done_ms=0))
     assert "iort archive verify" in str(iort("import", paths[1], robot, status=1).exception)
+
+
+HOLDS = {
+    # Where an import is held: the other one then runs as far as its own hold, or to its end.
+    "before its object": ("s3", "PutObject", "archive/"),
+    "before its row": ("dynamodb", "PutItem", ""),
+    "before its note": ("s3", "PutObject", "imports/"),
+}
+
+
+def held(cloud: Cloud, where: str, act: Callable[[], None]) -> Cloud:
+    """The cloud with clients of its own, which ``act`` once before the first such call."""
+    own, (service, operation, prefix) = replace(cloud), HOLDS[where]
+    acted: list[bool] = []
+
+    def hold(params: dict[str, Any], **_other: Any) -> None:
+        if params.get("Key", "").startswith(prefix) and not acted:
+            acted.append(True)
+            act()
+
+    own.client(service).meta.events.register(f"provide-client-params.{service}.{operation}", hold)
+    return own
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same", "there"),
+    [
+        # The second one writes the hour's object from what it has read before the first one's row.
+        ("before its row", "before its row", False, False),
+        ("before its row", "before its row", False, True),
+        ("before its row", "before its object", False, False),
+        ("before its row", "", False, True),
+        ("before its object", "before its row", False, True),
+        ("before its object", "", False, False),
+        ("before its row", "before its row", True, False),
+        ("before its note", "", True, False),
+    ],
+)
+def test_two_imports_at_once_lose_nothing(
+    embedded: EmbeddedCloud,
+    importer: tuple[str, Iort],
+    tmp_path: Path,
+    *,
+    first: str,
+    second: str,
+    same: bool,
+    there: bool,
+) -> None:
+    """The first is held while the second one runs, and the second one, if at all, until the first has ended;
+    of the ``same`` recording, or into an hour that is ``there`` already."""
+    (robot, iort), cloud = importer, embedded.cloud
+    paths, start_ns = [], fresh_ns()
+    for part in range(3):
+        (folder := tmp_path / str(part)).mkdir()
+        paths.append(made(folder, "bag", start_ns=start_ns + part * 10_000_000_000))
+    if there:
+        iort("import", paths[2], robot)
+    given = (paths[0], paths[0 if same else 1])
+    plans = [look([path], Choice(), start_us=None) for path in given]
+    for some in plans:
+        check(cloud, robot, some, archive=True, overlap=False, retention_s=86_400)
+    goes, ended = threading.Event(), threading.Event()
+
+    def import_second() -> None:
+        try:
+            run(other, robot, plans[1], retention_s=86_400, units_per_s=500)
+        finally:
+            goes.set()
+
+    def wait() -> None:
+        goes.set()
+        assert ended.wait(GUARD_S)
+
+    other = held(cloud, second, wait) if second else replace(cloud)
+    with ThreadPoolExecutor(1) as pool:
+        second_ends: list[Future[None]] = []
+
+        def let_second_go() -> None:
+            second_ends.append(pool.submit(import_second))
+            assert goes.wait(GUARD_S)
+
+        try:
+            run(held(cloud, first, let_second_go), robot, plans[0], retention_s=86_400, units_per_s=500)
+        finally:
+            ended.set()
+        second_ends[0].result(GUARD_S)
+
+    assert iort_of(embedded, "archive", "verify", robot).exit_code == 0
+    for stream, one in audited(cloud, robot).items():
+        assert one.complete
+        assert [each.samples for each in one.runs] == [COUNTS[stream]] * (2 + there - same)
+    assert "nothing to do" in iort("import", *given, robot).output
 
 
 def test_a_drive_on_the_border_of_the_retention_goes_into_the_archive(
