@@ -5,7 +5,6 @@ from __future__ import annotations
 import ipaddress
 import ssl
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path, PurePath
@@ -120,22 +119,9 @@ class ServerCertificate:
 
     def context(self) -> ssl.SSLContext:
         """A server's context, which takes over a renewed certificate by itself."""
-        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-        context.load_cert_chain(self.path)
-        loaded = self.path.stat().st_mtime_ns
+        from iort_station.page.background import tls_context  # noqa: PLC0415 - the robot's tests have no station
 
-        def look(_connection: ssl.SSLObject, _name: str | None, context: ssl.SSLContext) -> None:
-            nonlocal loaded
-            # This connection has the old one still. An error here would end it.
-            with suppress(OSError):
-                found = self.path.stat().st_mtime_ns
-                if found != loaded:
-                    context.load_cert_chain(self.path)
-                    loaded = found
-
-        # OpenSSL calls it at every handshake, whether the client names a server or not.
-        context.sni_callback = look
-        return context
+        return tls_context(self.path)
 
     def _good(self) -> bool:
         try:

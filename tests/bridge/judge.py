@@ -1,13 +1,16 @@
-"""A client of the bridge that we did not write, in a process of its own: see client.py."""
+"""`iort bridge` in a process, and a client of it that we did not write, in another one: see client.py."""
 
 from __future__ import annotations
 
 import base64
 import json
+import os
+import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +19,31 @@ from typing_extensions import Self
 from testkit.waiting import GUARD_S, until
 
 PLAYING, PAUSED, BUFFERING, ENDED = range(4)
+
+
+@contextmanager
+def bridging(
+    command: Sequence[str], environment: Mapping[str, str] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Run a command that is `iort bridge --json`, and give what it says of itself; it ends by Ctrl-C."""
+    with subprocess.Popen(
+        command,
+        env={**os.environ, **(environment or {})},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            line = process.stdout.readline()
+            assert line, process.stderr.read()
+            yield json.loads(line)
+        finally:
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=GUARD_S)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
 
 
 class Got(NamedTuple):
@@ -32,16 +60,22 @@ class Got(NamedTuple):
 
 
 class Judge:
-    """Connects within a ``with`` block, once it knows the server's topics."""
+    """Connects within a ``with`` block, once it knows the server's topics.
 
-    def __init__(self, url: str) -> None:
-        self._url = url
+    ``within`` is what a command begins with to run on another machine, and ``authority`` who signs the
+    servers' certificates that it trusts, if it is not the system.
+    """
+
+    def __init__(self, url: str, *, within: Sequence[str] = (), authority: Path | None = None) -> None:
+        self._url, self._within = url, within
+        self._trusts = {} if authority is None else {"SSL_CERT_FILE": str(authority)}
         self.events: list[dict[str, Any]] = []
 
     def __enter__(self) -> Self:
         script = Path(__file__).with_name("client.py")
         self._process = subprocess.Popen(
-            [sys.executable, "-W", "error::SyntaxWarning", str(script), self._url],
+            [*self._within, sys.executable, "-W", "error::SyntaxWarning", str(script), self._url],
+            env={**os.environ, **self._trusts},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

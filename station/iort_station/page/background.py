@@ -10,6 +10,7 @@ import threading
 from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from contextlib import asynccontextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from aiohttp import web
@@ -166,6 +167,27 @@ class BackgroundServer:
     async def pause(self, seconds: float) -> None:
         """The time between two looks for silent connections."""
         await asyncio.sleep(seconds)
+
+
+def tls_context(path: Path) -> ssl.SSLContext:
+    """A server's context with the key and the certificate of a file, which takes over by itself what is
+    written there later. Raises `OSError`, also for what is no certificate."""
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.load_cert_chain(path)
+    loaded = path.stat().st_mtime_ns
+
+    def look(_connection: ssl.SSLObject, _name: str | None, context: ssl.SSLContext) -> None:
+        nonlocal loaded
+        # This connection has the old one still. An error here would end it.
+        with suppress(OSError):
+            found = path.stat().st_mtime_ns
+            if found != loaded:
+                context.load_cert_chain(path)
+                loaded = found
+
+    # OpenSSL calls it at every handshake, whether the client names a server or not.
+    context.sni_callback = look
+    return context
 
 
 def _is_our_fault(record: logging.LogRecord) -> bool:

@@ -137,9 +137,13 @@ class Laboratory:
 
     def iort(self, *arguments: str, state: Path | None = None, status: int = 0) -> str:
         """The operator's command, on the cloud's machine."""
-        folder = state or self.state
-        environment = {EMBEDDED_VARIABLE: str(folder / kept.CLOUD), "IORT_STATE": str(folder)}
+        environment = self.environment(state)
         return self.cloud.run(str(BIN / "iort"), *arguments, environment=environment, status=status)
+
+    def environment(self, state: Path | None = None) -> dict[str, str]:
+        """The variables with which the operator's command finds the cloud."""
+        folder = state or self.state
+        return {EMBEDDED_VARIABLE: str(folder / kept.CLOUD), "IORT_STATE": str(folder)}
 
     def findings(self, status: int) -> dict[str, Any]:
         """What `iort doctor` finds."""

@@ -3,27 +3,41 @@ runs the same cloud."""
 
 from __future__ import annotations
 
+import http.client
 import os
 import shutil
 import signal
+import ssl
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
 from iort_station import kept
+from iort_station.bridge.door import PROTOCOL
+from iort_station.page.password import Password
 from local.deployment import ROOT
+from local.network.certificates import LASTS_S, Authority, ServerCertificate
 from local.processes import Child
 from local.up.commands import stop
 from local.up.service import NAME
 from testkit.namespaces import NoNamespacesError, two_machines
 from testkit.waiting import GUARD_S, until
+from tests.bridge.judge import Judge, bridging
 from tests.local.network.booted import booted
 from tests.local.network.laboratory import BIN, Laboratory, waiting
 
 pytestmark = pytest.mark.heavy
+HANDSHAKE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    "Sec-WebSocket-Protocol": PROTOCOL,
+}
 
 
 @pytest.fixture(scope="module")
@@ -181,6 +195,58 @@ def test_a_car_reaches_the_cloud_by_ipv6(laboratory, car):
         assert sent.wait(GUARD_S) == 0, sent.tail()
         assert "drive.bag" in laboratory.iort("files", "list", "car6")
         assert f"cars connect to [{address}]:{ports['mqtt']}" in laboratory.iort("doctor")
+
+
+def test_a_tool_elsewhere_needs_the_authority_and_the_password_of_the_page(laboratory, car):
+    """`iort bridge --listen` takes the page's certificate by itself, and takes over a renewed one."""
+    address, authority = laboratory.cloud.address, laboratory.state / "authority.pem"
+    with laboratory.running("--listen", address, "--page", address):
+        known = ssl.create_default_context(cafile=authority)
+        Password(laboratory.state).set("correct horse")
+        laboratory.iort("robots", "add", "car7", "--out", str(laboratory.folder))
+        car(laboratory.folder / "car7", "run")
+        until(lambda: "vesc" in laboratory.iort("streams", "car7"))
+        iort = [str(BIN / "iort"), "bridge", "car7", "--listen", address, "--port", "0", "--json"]
+        with bridging(laboratory.cloud.command(*iort), laboratory.environment()) as served:
+            url = urlsplit(served["url"])
+            assert (url.scheme, url.hostname, url.query) == ("wss", address, "key=PASSWORD")
+            assert (address, url.port) in laboratory.listeners()
+
+            def answer(query: str, trusts: ssl.SSLContext = known) -> tuple[int, str, str]:
+                """What a client on the car's machine gets: status, words, and the certificate's number."""
+                way = http.client.HTTPConnection(address, url.port)
+                with laboratory.car.socket() as plain:
+                    plain.settimeout(GUARD_S)
+                    plain.connect((address, url.port))
+                    with trusts.wrap_socket(plain, server_hostname=address) as way.sock:
+                        number = way.sock.getpeercert()["serialNumber"]
+                        way.request("GET", f"/?{query}", headers=HANDSHAKE)
+                        told = way.getresponse()
+                        words = "" if told.status == 101 else told.read().decode().strip()
+                        return told.status, words, number
+
+            refusal = 401, "the address must end in /?key= and the password"
+            for query in ("", "key=", "key=PASSWORD", "key=correct%20hors"):
+                assert answer(query)[:2] == refusal, query
+            right = "key=correct%20horse"
+            status, _, first = answer(right)
+            assert status == 101
+            # Who does not know the authority sends no password.
+            with pytest.raises(ssl.SSLCertVerificationError):
+                answer(right, ssl.create_default_context())
+            with Judge(
+                url._replace(query=right).geturl(), within=laboratory.car.command(), authority=authority
+            ) as judge:
+                judge.do("subscribe", topic="/iort/vesc")
+                seen = until(lambda: list(judge.got("/iort/vesc")))
+                assert "voltage_input" in seen[0].fields
+            # As after two months.
+            page = ServerCertificate(
+                Authority(laboratory.state), laboratory.state / "page.pem", (address,), renewed_s=LASTS_S
+            )
+            assert page.renew()
+            # The first connection after the change tells the server.
+            assert [answer(right)[2] == first for _ in range(2)] == [True, False]
 
 
 def test_systemd_starts_the_cloud_again_after_a_kill_and_stops_it(laboratory):

@@ -4,8 +4,6 @@ it, by a client that is not ours."""
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -20,29 +18,18 @@ from iort_station import data
 from iort_station.cloud import EMBEDDED
 from iort_station.operations import audit
 from local.demo import DOWNLINK
-from testkit.waiting import GUARD_S, until
-from tests.bridge.judge import Judge
+from testkit.waiting import until
+from tests.bridge.judge import Judge, bridging
 from tests.local.data.drives import Agent
 from tests.local.robots.test_shadow import Shadow
 
 
 @contextmanager
 def bridge(folder: Path, *arguments: str) -> Iterator[dict[str, Any]]:
-    """`iort bridge` in a process, with what it says of itself; it ends by Ctrl-C."""
+    """As `bridging`, for the cloud of a folder."""
     iort = [str(Path(sys.executable).parent / "iort"), "--local", "--embedded", str(folder / EMBEDDED.name)]
-    command = [*iort, "bridge", *arguments, "--port", "0", "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            assert process.stderr is not None
-            line = process.stdout.readline()
-            assert line, process.stderr.read()
-            yield json.loads(line)
-        finally:
-            process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=GUARD_S)
-    assert process.returncode == 130, errors
-    assert "Traceback" not in errors
+    with bridging([*iort, "bridge", *arguments, "--port", "0", "--json"]) as served:
+        yield served
 
 
 @pytest.fixture

@@ -199,12 +199,13 @@ def _access(
 def _tls(certificate: Path | None) -> ssl.SSLContext | None:
     if certificate is None:
         return None
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    # aiohttp takes longer to load than most commands to run.
+    from iort_station.page.background import tls_context  # noqa: PLC0415 - as above
+
     try:
-        context.load_cert_chain(certificate)
-    except (OSError, ssl.SSLError) as error:
+        return tls_context(certificate)
+    except OSError as error:
         raise StationError(f"{certificate} must be a PEM file with key and certificate: {error}") from error
-    return context
 
 
 def _tell(served: Served, what: str, *, as_json: bool) -> None:
