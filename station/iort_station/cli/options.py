@@ -10,8 +10,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from dataclasses import fields as dataclass_fields
 from datetime import datetime
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
-from botocore.exceptions import BotoCoreError
+from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.catalog.derived import DERIVED
 from iort_station import kept
@@ -144,6 +144,23 @@ def _kept_at(options: CloudOptions, *key: str) -> Path:
 
 
 # Words to the operator: on standard error, where they do not get into a pipe, and in the help.
+
+
+@contextmanager
+def resumable(verb: str) -> Iterator[None]:
+    """A verb that goes on if it is called again, whose page lists the rights that it needs."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"interrupted: {verb} again, and it goes on")
+        raise
+    except ClientError as error:
+        denied = {"AccessDenied", "AccessDeniedException", "ForbiddenException", "403"}
+        if error.response["Error"]["Code"] not in denied:
+            raise
+        raise StationError(
+            f"{error}: docs/how-to/{verb}.md lists the rights that `iort {verb}` needs"
+        ) from error
 
 
 def say(*lines: str) -> None:

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from botocore.exceptions import ClientError
 from rich.filesize import decimal
 from rich.progress import DownloadColumn, MofNCompleteColumn, TransferSpeedColumn
 
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
 from iort_station.cli.console import bar, errors, out, print_json, table
-from iort_station.cli.options import AsJson, DryRun, Robot, argument, examples, option, say
+from iort_station.cli.options import AsJson, DryRun, Robot, argument, examples, option, resumable
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.times import iso_s, time_us
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from iort_station.imports.run import Outcome
 
 commands = typer.Typer()
-_DENIED = {"AccessDenied", "AccessDeniedException", "403"}
 _HOUR_US = 3_600_000_000
 
 
@@ -96,38 +94,32 @@ def import_(
         raise StationError(f"--start is for one recording, got {len(found)}")
     days = int(cloud.find_output("storage", "RetentionDays") or DEFAULT_RETENTION_DAYS)
     try:
-        size = sum(
-            one.stat().st_size
-            for path in found
-            for one in ([path] if path.is_file() else path.iterdir())
-            if one.is_file()
-        )
-        with bar("reading", size, DownloadColumn(), TransferSpeedColumn()) as progress:
-            plans = planning.look(found, choice, start_us=start_us, progress=progress)
-        planning.check(cloud, robot, plans, archive=archive, overlap=overlap, retention_s=days * 86_400)
-        if not as_json:
-            for one in plans:
-                _show_plan(one)
-        outcomes: list[Outcome] = []
-        if not dry_run:
-            total = sum(sum(one.counts.values()) for one in plans if one.goes_on)
-            with bar("importing", total, MofNCompleteColumn()) as progress:
-                outcomes = run(
-                    cloud,
-                    robot,
-                    plans,
-                    retention_s=days * 86_400,
-                    units_per_s=units,
-                    every_s=choice.large_every_s,
-                    progress=progress,
-                )
-    except KeyboardInterrupt:
-        say("interrupted: import again, and it goes on")
-        raise
-    except ClientError as error:
-        if error.response["Error"]["Code"] not in _DENIED:
-            raise
-        raise StationError(f"{error}: docs/how-to/import.md lists the rights that an import needs") from error
+        with resumable("import"):
+            size = sum(
+                one.stat().st_size
+                for path in found
+                for one in ([path] if path.is_file() else path.iterdir())
+                if one.is_file()
+            )
+            with bar("reading", size, DownloadColumn(), TransferSpeedColumn()) as progress:
+                plans = planning.look(found, choice, start_us=start_us, progress=progress)
+            planning.check(cloud, robot, plans, archive=archive, overlap=overlap, retention_s=days * 86_400)
+            if not as_json:
+                for one in plans:
+                    _show_plan(one)
+            outcomes: list[Outcome] = []
+            if not dry_run:
+                total = sum(sum(one.counts.values()) for one in plans if one.goes_on)
+                with bar("importing", total, MofNCompleteColumn()) as progress:
+                    outcomes = run(
+                        cloud,
+                        robot,
+                        plans,
+                        retention_s=days * 86_400,
+                        units_per_s=units,
+                        every_s=choice.large_every_s,
+                        progress=progress,
+                    )
     except OSError as error:
         raise StationError(
             f"{error.filename or 'a temporary file'}: {error.strerror or error}; make room (TMPDIR names "

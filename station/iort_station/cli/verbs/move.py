@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from botocore.exceptions import ClientError
 from rich.filesize import decimal
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from iort_contract.tables import NO_ROBOT
 from iort_station.cli import options
 from iort_station.cli.console import bar, errors, out, print_json
-from iort_station.cli.options import AsJson, CloudOptions, DryRun, argument, examples, option, say
+from iort_station.cli.options import AsJson, CloudOptions, DryRun, argument, examples, option, resumable, say
 from iort_station.cloud import EMBEDDED, Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 
 commands = typer.Typer()
 AWS = "aws"
-_DENIED = {"AccessDenied", "AccessDeniedException", "ForbiddenException", "403"}
 
 
 @commands.command("move", epilog=examples("move --to aws --to-profile lab", "move --to ~/cloud-2 car7"))
@@ -64,7 +62,7 @@ def move_(
     source = context.obj.cloud()
     target = _target(source, to, to_profile, to_region)
     plan.check(source, target)
-    try:
+    with resumable("move"):
         for robot in names or ():
             # A robot that was removed has samples, and no row.
             inventory.check_recorded(source, registry.checked(robot))
@@ -79,13 +77,6 @@ def move_(
         if not names:
             # Messages that name no robot.
             moving.quarantine(NO_ROBOT)
-    except KeyboardInterrupt:
-        say("interrupted: move again, and it goes on")
-        raise
-    except ClientError as error:
-        if error.response["Error"]["Code"] not in _DENIED:
-            raise
-        raise StationError(f"{error}: docs/how-to/move.md lists the rights that a move needs") from error
     if as_json:
         print_json({"streams": moving.streams, **moving.counts, "problems": moving.problems})
     else:
