@@ -7,7 +7,7 @@ import json
 import socket
 import ssl
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 import boto3
@@ -43,9 +43,39 @@ def door(embedded, tmp_path_factory) -> Iterator[FileDoor]:
 
 
 @pytest.fixture
-def send(embedded, door) -> Callable[..., tuple[int, str]]:
-    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+def trusts(embedded) -> ssl.SSLContext:
+    return ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
 
+
+@pytest.fixture
+def begin(trusts, door) -> Callable[..., int]:
+    """Begin a request with one header, and send no body; return the status."""
+
+    def status(method: str, path: str, name: str, value: str) -> int:
+        connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=GUARD_S)
+        connection.putrequest(method, path)
+        connection.putheader(name, value)
+        connection.endheaders()
+        with closing(connection):
+            return connection.getresponse().status
+
+    return status
+
+
+@contextmanager
+def own_door(tmp_path: Path) -> Iterator[tuple[FileDoor, ServerCertificate]]:
+    """A door in front of no gateway, and its certificate; `ca.pem` has the authority."""
+    authority = Authority()
+    certificate = ServerCertificate(authority, tmp_path / "files.pem", (HOST,))
+    certificate.renew()
+    (tmp_path / "ca.pem").write_text(authority.pem)
+    given = {"gateway": "https://127.0.0.1:9", "bucket": "files", "certificate": certificate}
+    with FileDoor(HOST, 0, authority=tmp_path / "ca.pem", **given) as door:
+        yield door, certificate
+
+
+@pytest.fixture
+def send(trusts, door) -> Callable[..., tuple[int, str]]:
     def request(method: str, path: str, own: str = "127.0.0.1", **headers: str) -> tuple[int, str]:
         connection = http.client.HTTPSConnection(
             HOST, door.port, context=trusts, timeout=GUARD_S, source_address=(own, 0)
@@ -137,44 +167,24 @@ def test_a_header_that_no_signature_covers_copies_nothing(send, presigned, embed
 
 
 @pytest.mark.parametrize("bound", ["UPLOAD_URL_S", "_PART_S"])
-def test_a_part_that_never_ends_gives_its_place_back(door, presigned, embedded, monkeypatch, bound):
+def test_a_part_that_never_ends_gives_its_place_back(door, presigned, begin, monkeypatch, bound):
     monkeypatch.setattr(servers, bound, 0.3)
-    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
-    connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=GUARD_S)
-    connection.putrequest("PUT", presigned())
-    connection.putheader("Content-Length", "9")
-    connection.endheaders()
-    assert connection.getresponse().status == 408
-    connection.close()
+    assert begin("PUT", presigned(), "Content-Length", "9") == 408
     until(lambda: door._passing.total() == 0)
 
 
 @pytest.mark.parametrize("told", [("Content-Length", "9"), ("Transfer-Encoding", "chunked")])
-def test_a_get_with_a_body_takes_no_place(door, presigned, embedded, told):
-    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
-    connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=GUARD_S)
-    connection.putrequest("GET", presigned())
-    connection.putheader(*told)
-    connection.endheaders()
-    assert connection.getresponse().status == 400
-    connection.close()
+def test_a_get_with_a_body_takes_no_place(presigned, begin, told):
+    assert begin("GET", presigned(), *told) == 400
 
 
 @pytest.mark.parametrize("length", ["none", str(PART_BYTES + 1)])
-def test_no_body_passes_that_is_larger_than_a_part_of_a_file(door, presigned, embedded, length):
-    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
-    connection = http.client.HTTPSConnection(HOST, door.port, context=trusts, timeout=GUARD_S)
-    connection.putrequest("PUT", presigned())
+def test_no_body_passes_that_is_larger_than_a_part_of_a_file(presigned, begin, length):
     told = ("Transfer-Encoding", "chunked") if length == "none" else ("Content-Length", length)
-    connection.putheader(*told)
-    connection.endheaders()
-    assert connection.getresponse().status == 413
-    connection.close()
+    assert begin("PUT", presigned(), *told) == 413
 
 
-def test_addresses_with_many_requests_leave_places_to_others(door, presigned, embedded, send):
-    trusts = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
-
+def test_addresses_with_many_requests_leave_places_to_others(door, presigned, trusts, send):
     def begin(stack: ExitStack, own: str) -> None:
         """A request of an address whose body does not come."""
         raw = stack.enter_context(
@@ -206,30 +216,21 @@ def test_addresses_with_many_requests_leave_places_to_others(door, presigned, em
 
 def test_a_connection_that_never_asks_is_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(servers, "_IDLE_S", 0.2)
-    authority = Authority()
-    certificate = ServerCertificate(authority, tmp_path / "files.pem", (HOST,))
-    certificate.renew()
-    (tmp_path / "ca.pem").write_text(authority.pem)
-    trusts = ssl.create_default_context(cafile=tmp_path / "ca.pem")
-    given = {"gateway": "https://127.0.0.1:9", "bucket": "files", "certificate": certificate}
     with (
-        FileDoor(HOST, 0, authority=tmp_path / "ca.pem", **given) as door,
+        own_door(tmp_path) as (door, _),
         socket.create_connection((HOST, door.port), timeout=GUARD_S) as raw,
         # On a slow machine its end comes before that of the handshake.
         suppress(ConnectionError, ssl.SSLEOFError),
-        trusts.wrap_socket(raw, server_hostname=HOST) as silent,
+        ssl.create_default_context(cafile=tmp_path / "ca.pem").wrap_socket(
+            raw, server_hostname=HOST
+        ) as silent,
     ):
         silent.sendall(b"GET /files/")
         assert silent.recv(1) == b""
 
 
 def test_the_door_takes_over_a_renewed_certificate(tmp_path):
-    authority = Authority()
-    certificate = ServerCertificate(authority, tmp_path / "files.pem", (HOST,))
-    certificate.renew()
-    given = {"gateway": "https://127.0.0.1:9", "bucket": "files", "certificate": certificate}
-    (tmp_path / "ca.pem").write_text(authority.pem)
-    with FileDoor(HOST, 0, authority=tmp_path / "ca.pem", **given) as door:
+    with own_door(tmp_path) as (door, certificate):
         shown = [ssl.get_server_certificate((HOST, door.port)).strip()]
         certificate.path.unlink()
         assert certificate.renew()

@@ -26,9 +26,24 @@ def test_an_emulator_whose_broker_cannot_listen_ends(tmp_path):
     assert emulator.process.poll() == os.EX_UNAVAILABLE
 
 
-def test_an_emulator_that_is_killed_before_the_cloud_is_up_is_started_again_a_few_times(
-    tmp_path, monkeypatch
-):
+@pytest.fixture
+def up(tmp_path, monkeypatch):
+    """Start a kept cloud of a class, whose deployment fails."""
+
+    def deploy(*_given, **_settings):
+        raise LocalError("cdk deploy failed")
+
+    def start(cloud):
+        monkeypatch.setattr(run, "EmbeddedCloud", cloud)
+        monkeypatch.setattr("local.cloud.deploy", deploy)
+        options = ["--state", str(tmp_path), "--ports", "any"]
+        given = commands.parser("up", "", remembered=True).parse_args(options)
+        run._Kept(given, threading.Event()).run()
+
+    return start
+
+
+def test_an_emulator_that_is_killed_before_the_cloud_is_up_is_started_again_a_few_times(up):
     starts = []
 
     class Killed(EmbeddedCloud):
@@ -37,22 +52,14 @@ def test_an_emulator_that_is_killed_before_the_cloud_is_up_is_started_again_a_fe
             starts.append(self.emulator.pid)
             os.kill(self.emulator.pid, signal.SIGKILL)
 
-    def deploy(*_given, **_settings):
-        raise LocalError("cdk deploy failed")
-
-    monkeypatch.setattr(run, "EmbeddedCloud", Killed)
-    monkeypatch.setattr("local.cloud.deploy", deploy)
-    given = commands.parser("up", "", remembered=True).parse_args(
-        ["--state", str(tmp_path), "--ports", "any"]
-    )
     with pytest.raises(
         LocalError, match=r"(?s)emulator was ended by SIGKILL.*It ended 3 times within 10 min"
     ):
-        run._Kept(given, threading.Event()).run()
+        up(Killed)
     assert len(starts) == 3
 
 
-def test_a_cloud_that_loses_its_port_at_the_first_start_takes_and_keeps_another(tmp_path, monkeypatch):
+def test_a_cloud_that_loses_its_port_at_the_first_start_takes_and_keeps_another(up, tmp_path):
     others = []
 
     class Second(EmbeddedCloud):
@@ -62,16 +69,8 @@ def test_a_cloud_that_loses_its_port_at_the_first_start_takes_and_keeps_another(
                 others.append(socket.create_server((self.host, self.ports["mqtt"])))
             super().start_emulator(*given)
 
-    def deploy(*_given, **_settings):
-        raise LocalError("cdk deploy failed")
-
-    monkeypatch.setattr(run, "EmbeddedCloud", Second)
-    monkeypatch.setattr("local.cloud.deploy", deploy)
-    given = commands.parser("up", "", remembered=True).parse_args(
-        ["--state", str(tmp_path), "--ports", "any"]
-    )
     with pytest.raises(LocalError, match="cdk deploy failed"):
-        run._Kept(given, threading.Event()).run()
+        up(Second)
     with others[0] as other:
         kept = json.loads((tmp_path / "settings.json").read_text())["ports"]["mqtt"]
         assert kept != other.getsockname()[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import math
@@ -21,9 +22,8 @@ from hypothesis import strategies as st
 from iort_agent.ros import ros1_master, ros1_node
 from iort_agent.ros.json_message import Writer, decode, encode
 from iort_contract.limits import MessageError
-from iort_contract.ros.definition import parse
+from iort_contract.ros.definition import DURATION, LETTERS, STRING, TIME, Definition, Field, parse
 from testkit.waiting import GUARD_S
-from tests.rosbridge_json import as_rosbridge
 from tests.unit.agent.control.downlink_rig import POSE, POSE_MESSAGE, RULE, T0
 from tests.unit.contract.ros.ros_values import by_rosbags, definitions, values
 
@@ -179,6 +179,30 @@ def nulls(value: Any) -> int:
     if isinstance(value, (dict, list)):
         return sum(map(nulls, value.values() if isinstance(value, dict) else value))
     return int(value is None)
+
+
+def as_rosbridge(
+    definition: Definition, value: Any, field: Field | None = None, *, ros2: bool = False
+) -> Any:
+    """Convert a message as message_conversion.py of rosbridge_suite 0.11.17; bytes are its `uint8[]`."""
+    field = field or Field("", definition.kind, None)
+    if field.length is not None and field.kind in ("uint8", "char"):
+        return base64.standard_b64encode(bytes(value)).decode("ascii")
+    if field.length is not None:
+        one = Field(field.name, field.kind, None)
+        return [as_rosbridge(definition, item, one, ros2=ros2) for item in value]
+    if field.kind in ("float32", "float64"):
+        return value if math.isfinite(value) else None
+    if field.kind in (TIME, DURATION):
+        names = ("sec", "nanosec") if ros2 else ("secs", "nsecs")
+        return {names[0]: value["sec"], names[1]: value["nanosec"]}
+    if field.kind in LETTERS or field.kind == STRING:
+        return value
+    return {
+        inner.name: as_rosbridge(definition, value[inner.name], inner, ros2=ros2)
+        for inner in definition.fields(field.kind)
+        if inner.name in value
+    }
 
 
 @settings(deadline=None)  # rosbags makes classes of each definition

@@ -50,6 +50,18 @@ def in_window(ring: FakeRing, from_us: int, to_us: int) -> list[tuple[str, int, 
     ]
 
 
+def braked(folder: Path, **changes: Any) -> Rig:
+    """A robot that has driven for ten seconds, and braked hard."""
+    rig = Rig(folder, triggers={"hardbrake": {**BRAKE, **changes}})
+    rig.pass_s(10)
+    rig.brake()
+    return rig
+
+
+def full(*_: Any, **__: Any) -> None:
+    raise OSError(28, "No space left on device")
+
+
 def test_an_edge_keeps_the_window_around_it_byte_for_byte(tmp_path: Path) -> None:
     rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
     rig.pass_s(20)
@@ -220,9 +232,7 @@ def test_a_window_goes_on_over_a_restart_and_begins_in_the_run_before(tmp_path: 
 
 
 def test_the_clock_may_be_set_back_within_the_window(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
-    rig.pass_s(10)
-    rig.brake()
+    rig = braked(tmp_path)
     rig.clock.set_wall(T0 - 3600 * S)
     rig.pass_s(8)
     rig.cut()
@@ -262,9 +272,7 @@ def test_what_is_missing_is_told_with_the_reason(tmp_path: Path) -> None:
 
 
 def test_an_evicted_begin_is_told_and_a_window_without_messages_is_lost(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
-    rig.pass_s(10)
-    rig.brake()
+    rig = braked(tmp_path)
     rig.ring.evict(rig.ring.now_us() - 3 * S)
     rig.pass_s(8)
     rig.cut()
@@ -280,13 +288,8 @@ def test_an_evicted_begin_is_told_and_a_window_without_messages_is_lost(tmp_path
 def test_a_full_disk_keeps_the_incident_until_there_is_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
-    rig.pass_s(10)
-    rig.brake()
+    rig = braked(tmp_path)
     rig.pass_s(8)
-
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
@@ -302,14 +305,9 @@ def test_a_full_disk_keeps_the_incident_until_there_is_room(
 def test_a_full_disk_until_the_ring_has_nothing_more_loses_it_aloud(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
-    rig.pass_s(10)
-    rig.brake()
+    rig = braked(tmp_path)
     rig.pass_s(8)
     rig.ring.evict(rig.ring.now_us())
-
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     rig.cut()
@@ -322,9 +320,6 @@ def test_a_plan_that_cannot_be_written_is_an_alarm_and_written_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
-
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(plan, "write_below", full)
@@ -341,9 +336,7 @@ def test_a_damaged_plan_is_an_alarm(tmp_path: Path) -> None:
 
 
 def test_a_trigger_that_is_removed_or_changed_leaves_its_open_window(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, triggers={"hardbrake": BRAKE})
-    rig.pass_s(10)
-    rig.brake()
+    rig = braked(tmp_path)
     rig.watch.desire({"hardbrake": {**BRAKE, "before_s": 1.0, "topics": ["/scan"]}})
     rig.pass_s(1)
     rig.watch.desire({})
@@ -484,9 +477,7 @@ def test_a_window_that_reaches_into_one_that_was_cut_begins_where_that_ended(tmp
 
 
 def test_it_follows_one_that_was_uploaded_and_forgotten_before_a_restart(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, triggers={"hardbrake": {**BRAKE, "cooldown_s": 0.0}})
-    rig.pass_s(10)
-    rig.brake()
+    rig = braked(tmp_path, cooldown_s=0.0)
     rig.pass_s(4)
     rig.cut()
     rig.upload()
@@ -502,9 +493,7 @@ def test_it_follows_one_that_was_uploaded_and_forgotten_before_a_restart(tmp_pat
 
 
 def test_it_is_whole_where_the_cut_is_of_a_ring_whose_time_was_another(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, triggers={"hardbrake": {**BRAKE, "cooldown_s": 0.0}})
-    rig.pass_s(10)
-    rig.brake()
+    rig = braked(tmp_path, cooldown_s=0.0)
     rig.pass_s(4)
     rig.cut()
     rig.upload()
