@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from iort_contract.ros.definition import RULE
+
 SIZES = {
     "bool": 1, "int8": 1, "uint8": 1, "byte": 1, "char": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4,
     "int64": 8, "uint64": 8, "float32": 4, "float64": 8, "time": 8, "duration": 8,
@@ -59,9 +61,8 @@ class Message:
         self.types: dict[str, list[Field]] = {}
         self._read(kind)
         first, *others = self.types
-        rule = "=" * 80
         self.definition = "\n".join(
-            [self._texts[first], *(f"{rule}\nMSG: {other}\n{self._texts[other]}" for other in others)]
+            [self._texts[first], *(f"{RULE}\nMSG: {other}\n{self._texts[other]}" for other in others)]
         )
         self.md5sum = self._md5sum(kind)
 

@@ -32,6 +32,7 @@ from iort_agent.video.encoder import LIBRARIES, make_encoder, options
 from iort_agent.video.pictures import fitted, packed
 from iort_agent.video.ros_camera import images_of
 from iort_agent.video.sim_camera import Hall
+from iort_contract.ros.definition import RULE
 from testkit.target import Say, Target
 from testkit.waiting import InstrumentError
 
@@ -40,7 +41,6 @@ WIDTH, HEIGHT, RATES_HZ, KBPS = 640, 480, (15, 30), 1500
 ENCODE_TIMES, WHOLE_TIMES = 1.3, 2.5
 _START_US = 1_700_000_000_000_000
 _FFMPEG = "ffmpeg"
-_RULE = "=" * 80
 _IMAGE = f"""std_msgs/Header header
 uint32 height
 uint32 width
@@ -48,7 +48,7 @@ string encoding
 uint8 is_bigendian
 uint32 step
 uint8[] data
-{_RULE}
+{RULE}
 MSG: std_msgs/Header
 uint32 seq
 time stamp

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from tests.unit.contract.ros.ros_values import HEADER, RULE
+
 pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
@@ -34,8 +36,6 @@ from tests.unit.agent.test_agent import config_file
 
 CORE = "/sensors/core"
 VESC = "vesc_msgs/VescStateStamped"
-RULE = "=" * 80
-HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 VESC_TEXT = (
     f"Header header\nVescState state\n{HEADER}"
     f"{RULE}\nMSG: vesc_msgs/VescState\nint32 FAULT_CODE_NONE=0  # fine\nfloat64 speed\nint32 fault_code\n"

@@ -11,9 +11,8 @@ import pytest
 
 from tests.ros.conftest import Graph
 from tests.ros.process import Process
+from tests.unit.contract.ros.ros_values import HEADER, RULE
 
-RULE = "=" * 80
-HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 WHEEL = f"""# A type that nobody has installed.
 uint8 LEFT=0
 Header header

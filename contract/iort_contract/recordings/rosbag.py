@@ -21,7 +21,7 @@ from iort_contract.recordings import Message, RecordingError
 from iort_contract.recordings.files import INDEX, Reader, library, wrapped
 from iort_contract.recordings.scan import Scan
 from iort_contract.ros.decode import Decoder, Large, stamp_ns
-from iort_contract.ros.definition import parse
+from iort_contract.ros.definition import RULE, parse
 from iort_contract.ros.message import MessageType, RosMessage, RosType
 from iort_contract.topics import stream_of
 
@@ -229,7 +229,7 @@ class Recording:
         typesys = library("typesys")
         store = typesys.get_typestore(typesys.Stores.EMPTY) if is_idl else _known_types()
         if is_idl:
-            parts = [part.partition("\n")[2] for part in text.split(_SEPARATOR)[1:]]
+            parts = [part.partition("\n")[2] for part in text.split(f"{RULE}\n")[1:]]
             for part in parts if text.startswith(_IDL) else [text]:
                 store.register(typesys.get_types_from_idl(part))
         # Renamed between the versions for Python 3.8 and later.
@@ -256,8 +256,7 @@ def _named(msgtype: str) -> str:
     return f"{package}/msg/{name}" if name and "/" not in name else msgtype
 
 
-_SEPARATOR = "=" * 80 + "\n"
-_IDL = f"{_SEPARATOR}IDL: "
+_IDL = f"{RULE}\nIDL: "
 
 # vesc_msgs for ROS 2, since recordings of Foxy and Humble hold no definitions. The order is the wire's.
 VESC_STATE_ROS2 = """

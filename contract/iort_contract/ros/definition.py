@@ -34,6 +34,8 @@ STRING, WSTRING, TIME, DURATION = "string", "wstring", "time", "duration"
 TEXTS = (STRING, WSTRING)
 HEADER_TYPE = "std_msgs/Header"
 VARIABLE = -1
+# The line before each nested type.
+RULE = "=" * 80
 
 _SEPARATOR = re.compile(r"^={20,}\s*$", re.MULTILINE)
 _LINE = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d{0,12})\])?\s+([A-Za-z]\w*)\s*(=?)", re.ASCII)

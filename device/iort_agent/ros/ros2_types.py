@@ -13,7 +13,7 @@ from typing import Any, Iterator, NamedTuple
 
 from iort_agent.errors import SourceError
 from iort_contract.limits import MessageError
-from iort_contract.ros.definition import Definition, parse
+from iort_contract.ros.definition import RULE, Definition, parse
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +34,6 @@ _BUILTIN = frozenset(
 # IDL's names of builtin types, as Python's classes tell them -> those of message definitions.
 _IDL = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64", "char": "uint8"}
 _SEQUENCE = re.compile(r"sequence<(.*?)(?:, (\d+))?>(?!.*>)|(.*)\[(\d+)\]", re.ASCII)
-_RULE = "=" * 80
 _MAX_DEPTH = 50
 
 
@@ -131,7 +130,7 @@ def _nested(package: str, name: str, seen: set[str], depth: int) -> Iterator[str
         if nested not in seen:
             seen.add(nested)
             inner = nested.split("/")
-            yield f"{_RULE}\nMSG: {nested}\n{_definition(inner[0], inner[1])}"
+            yield f"{RULE}\nMSG: {nested}\n{_definition(inner[0], inner[1])}"
             yield from _nested(inner[0], inner[1], seen, depth + 1)
 
 

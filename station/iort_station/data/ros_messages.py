@@ -16,6 +16,7 @@ from iort_contract.ros.decode import HEADER
 from iort_contract.ros.definition import (
     HEADER_TYPE,
     LETTERS,
+    RULE,
     STRING,
     VARIABLE,
     WSTRING,
@@ -32,7 +33,7 @@ from iort_station.data.ros_forms import form_of
 from iort_station.errors import StationError
 
 _WSTRING = re.compile(rf"\b{WSTRING}\b")
-_HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+_HEADER_TEXT = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 
 
 def types(cloud: Cloud, robot: str) -> dict[str, MessageType]:

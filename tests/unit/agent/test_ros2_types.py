@@ -11,9 +11,7 @@ import pytest
 
 from iort_agent.errors import SourceError
 from iort_agent.ros.ros2_types import Types, installed, service
-from iort_contract.ros.definition import parse
-
-RULE = "=" * 80
+from iort_contract.ros.definition import RULE, parse
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from iort_contract.ros.definition import (
     DURATION,
     HEADER_TYPE,
     LETTERS,
+    RULE,
     STRING,
     TIME,
     VARIABLE,
@@ -35,7 +36,6 @@ ANSWER_S = 10.0
 # rosapi may start after the server.
 AGAIN_S = 30.0
 
-_RULE = "=" * 80
 _BUILTIN = {*LETTERS, STRING, TIME, DURATION}
 # ROS 2's names for ROS 1's types.
 _NAMES = {
@@ -78,7 +78,7 @@ def from_typedefs(kind: str, typedefs: Any) -> Structure:
     if kind not in bodies:
         raise MessageError(f"{kind}: rosapi's answer lacks it")
     nested = [
-        f"{_RULE}\nMSG: {name}\n{body}"
+        f"{RULE}\nMSG: {name}\n{body}"
         for name, body in bodies.items()
         if name != kind and name not in _BUILTIN
     ]

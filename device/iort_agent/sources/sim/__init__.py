@@ -22,7 +22,7 @@ from iort_contract.catalog.streams import POSE_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.commands import DRIVE_TYPE, MAX_LEASE_MS, ROS2_DRIVE_TYPE
-from iort_contract.ros.definition import Definition, parse
+from iort_contract.ros.definition import RULE, Definition, parse
 from iort_contract.topics import check_stream
 from iort_contract.track import Track, parse_track
 
@@ -96,18 +96,17 @@ class Sensors:
         }
 
 
-_RULE = "=" * 80
 _STAMPS = {DRIVE_TYPE: "uint32 seq\ntime stamp", ROS2_DRIVE_TYPE: "builtin_interfaces/Time stamp"}
 _DRIVES = {
     kind: parse(
         kind,
         f"""std_msgs/Header header
 AckermannDrive drive
-{_RULE}
+{RULE}
 MSG: std_msgs/Header
 {stamp}
 string frame_id
-{_RULE}
+{RULE}
 MSG: ackermann_msgs/AckermannDrive
 float32 steering_angle
 float32 steering_angle_velocity

@@ -28,9 +28,8 @@ from iort_contract.messages.commands import Command, encode_command
 from iort_contract.ros.definition import Definition, layout, parse
 from testkit.agent import Loopback, ManualClock, link_of
 from testkit.waiting import GUARD_S
+from tests.unit.contract.ros.ros_values import HEADER, RULE
 
-RULE = "=" * 80
-HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 POSE = f"""Header header
 Pose pose
 {HEADER}{RULE}

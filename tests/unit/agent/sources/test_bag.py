@@ -25,6 +25,7 @@ from iort_contract.recordings.rosbag import VESC_STATE_ROS2, VESC_TYPE
 from iort_contract.ros.message import message_type, type_id
 from testkit.agent import ManualClock
 from tests.recordings import recording
+from tests.unit.contract.ros.ros1_messages import LINE
 
 NOW = 1_700_000_000_000_000
 # When the written recordings start, in nanoseconds.
@@ -33,7 +34,6 @@ START = 1_600_000_000_000_000_000
 # The newest rosbags for Python 3.8 writes ROS 2 recordings in one format only.
 STORAGES = ["mcap", "sqlite3"] if hasattr(rosbag2, "StoragePlugin") else ["sqlite3"]
 
-LINE = "=" * 80 + "\n"
 
 Sample = Tuple[str, int, Any]
 

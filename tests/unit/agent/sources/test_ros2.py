@@ -24,6 +24,7 @@ from iort_agent.sources.repeats import Repeats
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.sources.ros2 import Ros2Config, Ros2Source
 from iort_contract.catalog.streams import TYPES_STREAM
+from iort_contract.ros.definition import RULE
 from iort_contract.ros.message import RosMessage, message_type
 from iort_contract.topics import matches, stream_of
 from testkit.agent import ManualClock
@@ -31,7 +32,6 @@ from testkit.waiting import GUARD_S, until
 from tests.unit.agent.ros2_graph import LATCHED, RELIABLE, FakeGraph, FakeTypes
 
 FLOAT, STAMPED = "a_msgs/msg/Float", "a_msgs/msg/Stamped"
-RULE = "=" * 80
 TEXTS = {
     FLOAT: "float64 x\n",
     STAMPED: f"std_msgs/Header header\nfloat64 x\n{RULE}\nMSG: std_msgs/Header\n"

@@ -10,12 +10,11 @@ from hypothesis import given, settings
 from iort_agent.sources.rosbridge import Repeats
 from iort_agent.sources.rosbridge.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs
 from iort_contract.limits import MessageError
-from iort_contract.ros.definition import Definition, md5sum, parse
+from iort_contract.ros.definition import RULE, Definition, md5sum, parse
 from testkit.agent import ManualClock
 from tests.unit.agent.control.downlink_rig import POSE
 from tests.unit.contract.ros.ros_values import HEADER, definitions, text_of
 
-RULE = "=" * 80
 STATUS = """# what it is
 byte OK=0
 string NAME= a name # and more

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 
-LINE = "=" * 80 + "\n"
+from tests.unit.contract.ros.ros1_messages import LINE
+
 HEADER = f"\n{LINE}MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
 STAMPED = f"std_msgs/Header header\nB b{HEADER}{LINE}MSG: a_msgs/B\n"
 

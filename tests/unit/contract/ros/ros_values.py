@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from iort_contract.ros.definition import (
     DURATION,
     LETTERS,
+    RULE,
     STRING,
     TIME,
     VARIABLE,
@@ -24,7 +25,6 @@ from iort_contract.ros.definition import (
 )
 from iort_contract.ros.plan import MAX_ELEMENTS
 
-RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 ROS2_HEADER = f"{RULE}\nMSG: std_msgs/msg/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
 _numbers = itertools.count()

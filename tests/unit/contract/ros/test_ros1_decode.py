@@ -22,7 +22,7 @@ from iort_contract.ros.plan import MAX_ELEMENTS
 from tests.examples import examples
 from tests.flatten import flatten
 from tests.recordings import recording
-from tests.unit.contract.ros.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
+from tests.unit.contract.ros.ros1_messages import HEADER, LINE, STAMPED, header, nested, text, u32
 from tests.unit.contract.ros.ros_values import by_rosbags, definitions, values, view_of
 
 
@@ -175,12 +175,7 @@ def test_fields_beyond_512_are_cut_from_the_view_and_counted(
 @pytest.mark.parametrize("leaf", ["uint8 u", "string s", "string[0] s", "uint8[] u"])
 def test_nested_types_give_a_bounded_view(length: str, leaf: str) -> None:
     """A definition of a few lines can describe more fields than anyone can visit."""
-    kinds = [f"T{i}" for i in range(20)]
-    line = "".join(f"{{0}}{length} a{i}\n" for i in range(9 if not length else 1))
-    definition = line.format(kinds[0])
-    for kind, inner in zip(kinds, kinds[1:]):
-        definition += f"{LINE}MSG: a_msgs/{kind}\n{line.format(inner)}"
-    definition += f"{LINE}MSG: a_msgs/{kinds[-1]}\n{leaf}\n"
+    definition = nested(length, leaf)
     for select in (None, ["a0.x"]):
         try:
             Decoder(parse("a_msgs/A", definition), select=select).decode(bytes(1000))

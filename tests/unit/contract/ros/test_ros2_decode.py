@@ -16,6 +16,7 @@ from iort_contract.ros.decode import Decoder, stamp_ns
 from iort_contract.ros.definition import VARIABLE, Field, layout, parse, short_kind
 from iort_contract.ros.plan import MAX_ELEMENTS, SIZES
 from tests.examples import examples
+from tests.unit.contract.ros.ros1_messages import nested
 from tests.unit.contract.ros.ros2_messages import HEADER, LINE, STAMPED, Cdr
 from tests.unit.contract.ros.ros_values import by_rosbags, definitions, values, view_of
 
@@ -273,12 +274,7 @@ def test_large_arrays_are_taken_with_their_places(order: str) -> None:
 @pytest.mark.parametrize("length", ["", "[64]", "[16777216]"])
 @pytest.mark.parametrize("leaf", ["uint8 u", "string s", "string[0] s", "uint8[] u", ""])
 def test_nested_types_give_a_bounded_view(length: str, leaf: str, order: str) -> None:
-    kinds = [f"T{i}" for i in range(20)]
-    line = "".join(f"{{0}}{length} a{i}\n" for i in range(9 if not length else 1))
-    definition = line.format(kinds[0])
-    for kind, inner in zip(kinds, kinds[1:]):
-        definition += f"{LINE}MSG: a_msgs/{kind}\n{line.format(inner)}"
-    definition += f"{LINE}MSG: a_msgs/{kinds[-1]}\n{leaf}\n"
+    definition = nested(length, leaf)
     for select in (None, ["a0.x"]):
         # Only an empty message has the length of this definition.
         with pytest.raises(MessageError):

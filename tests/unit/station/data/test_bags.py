@@ -23,9 +23,9 @@ from iort_station.data import bags
 from iort_station.data.ros_forms import ConversionError, form_of
 from iort_station.errors import StationError
 from testkit.ros1_types import Message
+from tests.unit.contract.ros.ros1_messages import LINE
 from tests.unit.station.data.test_export import of_some_definition
 
-LINE = "=" * 80 + "\n"
 T_NS = 1_700_000_000_123_456_789
 NOETIC, JAZZY = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
 

@@ -28,6 +28,8 @@ from iort_station.data import conditions, select
 from iort_station.data.inventory import unit
 from iort_station.errors import StationError
 from testkit.dynamodb import ARCHIVE, ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
+from tests.unit.contract.ros.ros1_messages import LINE
+from tests.unit.contract.ros.ros_values import HEADER, ROS2_HEADER
 
 TOPIC = build_topic("dt", "car", "vesc")
 START = 1_700_000_000_000_000
@@ -380,9 +382,6 @@ def test_a_field_has_its_known_unit(stream: str, name: str, expected: str) -> No
     assert unit(stream, name) == expected
 
 
-LINE = "=" * 80 + "\n"
-HEADER = LINE + "MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
-ROS2_HEADER = LINE + "MSG: std_msgs/msg/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
 VECTOR = LINE + "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 VESC_STATE = LINE + "MSG: vesc_msgs/VescState\nfloat64 speed\nfloat64 charge_drawn\nint32 fault_code\n"
 STAMPED_VESC = "Header header\nvesc_msgs/VescState state\n" + HEADER + VESC_STATE

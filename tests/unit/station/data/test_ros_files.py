@@ -21,10 +21,10 @@ from iort_station.errors import StationError
 from testkit.dynamodb import TELEMETRY, item_of
 from tests.flatten import flatten
 from tests.foxglove import flat, opened
+from tests.unit.contract.ros.ros1_messages import LINE
+from tests.unit.contract.ros.ros_values import HEADER
 from tests.unit.station.data.test_queries import cloud_of
 
-LINE = "=" * 80 + "\n"
-HEADER = LINE + "MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 STAMPED = "Header header\nB b\n" + HEADER + LINE + "MSG: a_msgs/B\nfloat64 x\nint32 code\n"
 RICH = (
     "uint8 KIND=3\nbool on\nuint8 small\nint64 large\nstring name\ntime at\nduration took\n"
