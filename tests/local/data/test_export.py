@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from iort_contract.ros.decode import HEADER
 from iort_station import data
 from iort_station.cloud import Cloud
+from iort_station.times import iso
 from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent
 from tests.recordings import recording
@@ -91,6 +93,13 @@ def _becomes_a_dataset(cloud, robot, iort, dataset):
     assert "has no analysed drives in this range: run `iort analyse`" in str(done.exception)
     done = iort(*learning, "--episodes", "runs", "--fps", "50")
     assert done.exit_code == 0, done.output
+    episodes = json.loads((dataset / "meta/iort.json").read_text())["episodes"]
+    rows = pq.read_table(dataset / "data").num_rows
+    assert done.stdout.strip().endswith(f": {len(episodes)} episodes of {rows:,} frames")
+    longest = max(episodes, key=lambda one: one["to_us"] - one["from_us"])
+    within = ["--from", iso(longest["from_us"]), "--to", iso(longest["to_us"])]
+    alone = [*learning[:4], *within, "--out", f"{dataset}-of-one", "--episodes", "runs", "--fps", "50"]
+    assert ": 1 episode of " in iort(*alone).stdout
     assert "action: servo.data" in done.stderr
     recorded = data.query(cloud, robot, "vesc", fields=["current_motor"]).columns["current_motor"]
     frames = pq.read_table(dataset / "data").to_pydict()

@@ -104,23 +104,25 @@ def export(
             progress=progress,
         )
     counts = {**vars(written), "file": str(out), "fps": fps}
-    tell(counts, f"{out}: {written.episodes:,} episodes of {written.frames:,} frames", as_json=as_json)
+    made = f"{_counted(written.episodes, 'episode')} of {_counted(written.frames, 'frame')}"
+    tell(counts, f"{out}: {made}", as_json=as_json)
     options.say(f"state: {', '.join(map(str, state))}")
     options.say(f"action: {', '.join(map(str, action))}")
     if written.left_out:
-        kind = learning.episodes or "drives"
-        options.say(f"{written.left_out:,} {kind} are left out; the first: {written.reason}")
+        kind = (learning.episodes or "drives").removesuffix("s")
+        options.say(f"left out: {_counted(written.left_out, kind)}; the first: {written.reason}")
+    before = "the image before stands in place of each"
     if written.not_kept:
-        options.say(
-            f"the robot has not kept {written.not_kept:,} images: the ones before stand in their places. "
-            "Incidents have every image"
-        )
+        images = _counted(written.not_kept, "image")
+        options.say(f"not kept by the robot: {images}; {before}. Incidents have every image")
     if written.damaged:
-        options.say(f"{written.damaged:,} images cannot be shown: the ones before them stand in their places")
+        options.say(f"cannot be shown: {_counted(written.damaged, 'image')}; {before}")
     if written.resized:
-        options.say(
-            f"{written.resized:,} images had another size than their camera's first, and were resized"
-        )
+        options.say(f"resized to the first of their camera: {_counted(written.resized, 'image')}")
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
 
 
 def _unit(cloud: Cloud, robot: str, field: Field) -> str:
