@@ -120,7 +120,8 @@ def _decoded(items: Iterable[Item], refuse: Refuse) -> Iterator[tuple[list[_Entr
             steps = [own for _, _, own in run if own is not None]
             block = decode_steps(steps, lambda _name: True) if len(steps) == len(run) else None
             if block is not None:
-                yield [_of_steps(item, envelope, block) for item, envelope, _ in run], block
+                fields = list(block.columns)
+                yield [_Entry(item, _head(one), one.about, fields) for item, one, _ in run], block
                 continue
             entries, blocks = [], []
             for item, envelope, _ in run:
@@ -142,10 +143,6 @@ def _envelopes(items: Iterable[Item], refuse: Refuse) -> Iterator[tuple[Item, En
             refuse(item, str(error))
         else:
             yield item, envelope, steps_of(envelope) if len(envelope.behind) <= _MUCH_TEXT else None
-
-
-def _of_steps(item: Item, envelope: Envelope, block: Block) -> _Entry:
-    return _Entry(item, _head(envelope), envelope.about, list(block.columns))
 
 
 def _head(envelope: Envelope) -> Envelope:

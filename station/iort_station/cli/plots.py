@@ -156,7 +156,8 @@ def distribution(runs: Sequence[Run], fields: Sequence[str]) -> Figure:
     for panel, field in zip(panels, fields, strict=True):
         columns = [column[~np.isnan(column)] for column in (_column(run, field) for run in runs)]
         everything = np.concatenate(columns)
-        bins = np.histogram_bin_edges(everything, bins=_bins(everything)) if len(everything) else 1
+        count = int(min(80, max(10, np.sqrt(len(everything)))))
+        bins = np.histogram_bin_edges(everything, bins=count) if len(everything) else 1
         for i, (run, column) in enumerate(zip(runs, columns, strict=True)):
             if not len(column):
                 continue
@@ -245,10 +246,6 @@ def _thinned(times_us: Any, values: Any) -> tuple[Any, Any]:
     usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0
     gaps = np.flatnonzero(steps > max(_GAP_US, _GAP * usual)) + 1
     return np.insert(times_us, gaps, times_us[gaps - 1] + 1), np.insert(values, gaps, np.nan)
-
-
-def _bins(values: Any) -> int:
-    return int(min(80, max(10, np.sqrt(len(values)))))
 
 
 def _style(i: int) -> dict[str, Any]:

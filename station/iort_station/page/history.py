@@ -11,7 +11,7 @@ import numpy as np
 
 from iort_analysis.samples.batches import RefusedItems
 from iort_analysis.samples.blocks import Column, values
-from iort_analysis.samples.positions import PositionFields, position_fields
+from iort_analysis.samples.positions import position_fields
 from iort_contract.catalog.derived import PARAMETERS, SOURCES
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.messages.files import ATTACHMENT_FIELDS
@@ -85,7 +85,8 @@ def history(cloud: Cloud, request: Mapping[str, str]) -> HistoryAnswer:
         # The fields of an attachment belong together, so they come from one sample.
         parts, ends = values(result.columns[name]), _last(_known(result.columns[key]), starts)
         rows_of[name] = {"mean": [parts[end] for end in ends]}
-    if several and n and (place := _position(columns)) is not None:
+    numbers = [name for name, (column, *_) in columns.items() if column.dtype.kind == "f"]
+    if several and n and (place := position_fields(numbers)) is not None:
         # The mean of a curve is a place where the robot never was.
         each = [columns[name][0] for name in place.names]
         ends = _last(~np.isnan(each).any(axis=0), starts)
@@ -147,10 +148,6 @@ def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bo
         "least": values(np.fmin.reduceat(least, starts)),
         "most": values(np.fmax.reduceat(most, starts)),
     }
-
-
-def _position(columns: Mapping[str, tuple[Column, ...]]) -> PositionFields | None:
-    return position_fields([name for name, (column, *_) in columns.items() if column.dtype.kind == "f"])
 
 
 def _known(column: Column) -> Any:
