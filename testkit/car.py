@@ -28,7 +28,8 @@ from iort_agent.mqtt.uplink import Link
 from iort_agent.runtime import make_uplink
 from iort_agent.sources.sim import Sensors
 from iort_agent.sources.sim.vehicle import Vehicle, VehicleConfig
-from iort_contract.catalog.streams import RTT_FIELDS
+from iort_contract.catalog.streams import POSE_STREAM, RTT_FIELDS
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.topics import BROKER, PING, PONG, build_topic
 from iort_station.fleet.robots import Bundle
@@ -96,15 +97,17 @@ RATE_HZ = 50
 _STEP_S = 0.02
 
 
-def simulated_drive(count: int, *, rate_hz: float = RATE_HZ, after_s: float = 0.0) -> list[dict[str, Value]]:
-    """Return so many samples of the same drive, from ``after_s`` on."""
+def simulated_drive(
+    count: int, *, rate_hz: float = RATE_HZ, after_s: float = 0.0, stream: str = VESC_STREAM
+) -> list[dict[str, Value]]:
+    """Return so many samples of the same drive, of its VESC or its pose, from ``after_s`` on."""
     vehicle = Vehicle(VehicleConfig(), seed=1)
     for _ in range(round(after_s / _STEP_S)):
         vehicle.step(_STEP_S)
     samples, measured = [], Sensors(vehicle, seed=1)
     for _ in range(count):
         vehicle.step(min(_STEP_S, 1 / rate_hz))
-        samples.append(measured.vesc())
+        samples.append(measured.pose() if stream == POSE_STREAM else measured.vesc())
     return samples
 
 

@@ -24,18 +24,20 @@ _CATCH_UP_S = 120.0
 Sample = tuple[int, dict[str, Value]]
 
 
-def simulated(points: int) -> list[Sample]:
+def simulated(points: int, stream: str = VESC_STREAM) -> list[Sample]:
     """Return the time in microseconds and the fields of every sample of a drive that ended a minute ago."""
     first_us = (int(time.time()) - points // RATE_HZ - 60) * 1_000_000
     times = (first_us + i * 1_000_000 // RATE_HZ for i in range(points))
-    return list(zip(times, simulated_drive(points), strict=True))
+    return list(zip(times, simulated_drive(points, stream=stream), strict=True))
 
 
-def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[str, Any]]:
+def store(
+    target: Target, robot: str, samples: Sequence[Sample], stream: str = VESC_STREAM
+) -> list[dict[str, Any]]:
     """Put one batch a second into the table, and wait until Lambda 2 has summarised all; return the items."""
     serialize = TypeSerializer().serialize
     client, table = target.cloud.client("dynamodb"), target.cloud.output("storage", "TelemetryTable")
-    topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)
+    topic = build_topic(RECORD, robot, stream, target.cloud.namespace)
     expires_s = int(time.time()) + _KEPT_S
     items = []
     for seq, at in enumerate(range(0, len(samples), RATE_HZ)):
@@ -46,7 +48,7 @@ def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[st
         items.append({name: serialize(value) for name, value in item.items()})
         client.put_item(TableName=table, Item=items[-1])
     until(
-        lambda: audit.samples_summarized(target.cloud, robot, VESC_STREAM) >= len(samples),
+        lambda: audit.samples_summarized(target.cloud, robot, stream) >= len(samples),
         "Lambda 2 to summarise what was stored",
         _CATCH_UP_S,
     )

@@ -26,6 +26,7 @@ ALL = (
     "drive",
     "stop",
     "page",
+    "past",
     "cold",
     "analysis",
     "kept",

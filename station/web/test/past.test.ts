@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { FIELD_TABLE, type HistoryAnswer } from "../src/base/contract";
+import { clockTime, dayTime, when } from "../src/base/format";
 import { lastAt } from "../src/base/range";
 import { together } from "../src/history/chart";
 import { Past } from "../src/history/past";
@@ -83,4 +84,10 @@ test("a robot's text is no formula in what is copied", () => {
   for (const text of ["=1+1", "@SUM(A1)", "+1", "-1", " \t=1", "\r\n=1", "\uff1d1"])
     assert.equal(harmless(text), `'${text}`);
   for (const text of ["", "idle", "a=1", "1-2", "'=1"]) assert.equal(harmless(text), text);
+});
+
+test("a time that no calendar has is written as nothing, and not an error", () => {
+  assert.match(dayTime(1_700_000_000, { fractionalSecondDigits: 1 }), /^Tue 14 Nov \d\d:\d\d:20\.0$/);
+  assert.match(clockTime(1_700_000_000), /^\d\d:\d\d:20$/);
+  for (const at of [NaN, Infinity, -1e300, 8.65e12]) assert.match(when(at), /^– – \S+/);
 });

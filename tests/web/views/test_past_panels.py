@@ -315,6 +315,40 @@ def test_a_table_has_the_rows_at_the_playhead_to_sort_and_to_copy(show):
     assert {row["time"][:14] for row in copied} == {"2023-11-14T22:"}
 
 
+# A chart's canvas is cleared when it is drawn, and only then.
+COUNT_DRAWS = """() => {
+  [window.draws, window.lines] = [0, 0];
+  const { clearRect } = CanvasRenderingContext2D.prototype;
+  CanvasRenderingContext2D.prototype.clearRect = function (...box) {
+    window.draws += 1;
+    clearRect.apply(this, box);
+  };
+  const count = (changes) => (window.lines += changes.length);
+  new MutationObserver(count).observe(document.querySelector(".rows tbody"), { childList: true });
+}"""
+
+
+@pytest.mark.parametrize("over", [".map", ".xy:not(.map)", "section[aria-label='Speed · X, pose']"])
+def test_pointing_moves_what_shows_the_playhead_and_draws_no_chart_again(show, over):
+    page = show("map:pose:speed,speed~pose/x,xy:speed:current_motor,voltage_input,table:vesc")
+    page.evaluate(COUNT_DRAWS)
+    plot = page.locator(f"{over} .u-over")
+    plot.scroll_into_view_if_needed()
+    box = plot.bounding_box()
+    seen = set()
+    for step in range(1, 20):
+        page.mouse.move(box["x"] + box["width"] * step / 20, box["y"] + box["height"] * (0.3 + step % 3 / 5))
+        drawn(page)
+        seen.add((playhead(page), *mark(page)))
+    assert len(seen) > 5, "the pointer moves the playhead and the car"
+    current, at = page.locator(".rows tr[aria-current]"), page.locator(".scrub-at")
+    until(lambda: current.inner_text()[:19] == at.inner_text()[:19], "the table at the playhead")
+    assert (page.evaluate("draws"), page.evaluate("lines")) == (0, 0)
+    # Other colours are drawn: this is counted.
+    page.emulate_media(color_scheme="dark")
+    until(lambda: page.evaluate("draws") >= 4, "every chart in the other colours")
+
+
 def test_the_arrangement_is_kept_and_shared_by_its_link(show, url, open_page):
     page = show("speed,voltage_input")
     labels = "[...document.querySelectorAll('.result .charts .panel')].map((panel) => panel.ariaLabel)"

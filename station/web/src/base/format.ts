@@ -132,31 +132,37 @@ function humanise(field: string): string {
   return capital(words.join(" "));
 }
 
+/** Formats of times, each made once: that takes a hundred times as long as a text by it. */
+const formats = new Map<string, Intl.DateTimeFormat>();
+const DAY = { weekday: "short", day: "numeric", month: "short" } as const;
+const TIME = { hour: "2-digit", minute: "2-digit", second: "2-digit" } as const;
+// No date is further from 1970.
+const MOST_S = 8.64e12;
+
+function timeFormat(options: Intl.DateTimeFormatOptions): Intl.DateTimeFormat {
+  const key = JSON.stringify(options);
+  let format = formats.get(key);
+  if (!format) formats.set(key, (format = new Intl.DateTimeFormat("en-GB", options)));
+  return format;
+}
+
+const timeText = (seconds: number, options: Intl.DateTimeFormatOptions): string =>
+  Math.abs(seconds) <= MOST_S ? timeFormat(options).format(seconds * 1000) : NOTHING;
+
 /** This device's time zone at a time: UTC, CET, GMT+2. */
 export function zone(seconds: number): string {
-  const parts = new Intl.DateTimeFormat("en-GB", { timeZoneName: "short" }).formatToParts(seconds * 1000);
+  const at = Math.abs(seconds) <= MOST_S ? seconds * 1000 : undefined;
+  const parts = timeFormat({ timeZoneName: "short" }).formatToParts(at);
   return parts.find(({ type }) => type === "timeZoneName")?.value ?? "local time";
 }
 
 /** The local time of day: 14:03:27. */
-export function clockTime(seconds: number): string {
-  return new Date(seconds * 1000).toLocaleTimeString("en-GB");
-}
+export const clockTime = (seconds: number): string => timeText(seconds, TIME);
 
 /** The local time of day, with the date unless it is today: Fri 20 Nov 14:03:27. */
 export function dayTime(seconds: number, options: Intl.DateTimeFormatOptions = {}): string {
-  const at = new Date(seconds * 1000);
-  const time = at.toLocaleTimeString("en-GB", {
-    hour: "2-digit",
-    minute: "2-digit",
-    second: "2-digit",
-    ...options,
-  });
-  const day =
-    at.toDateString() === new Date().toDateString()
-      ? ""
-      : `${at.toLocaleDateString("en-GB", { weekday: "short", day: "numeric", month: "short" })} `;
-  return day + time;
+  const today = new Date(seconds * 1000).toDateString() === new Date().toDateString();
+  return `${today ? "" : `${timeText(seconds, DAY)} `}${timeText(seconds, { ...TIME, ...options })}`;
 }
 
 /** As `dayTime`, with the time zone: Fri 20 Nov 14:03:27 CET. */

@@ -20,8 +20,16 @@ export function paint(): Paint {
   return { text: colour("--muted"), grid: colour("--grid") };
 }
 
+/** The root's font size, which is asked for again after a second: within a frame that costs a layout of its styles. */
+const root = { px: 16, at: -Infinity };
+
 export function rem(times: number): number {
-  return times * parseFloat(getComputedStyle(document.documentElement).fontSize);
+  const now = performance.now();
+  if (now - root.at > 1000) {
+    root.px = parseFloat(getComputedStyle(document.documentElement).fontSize);
+    root.at = now;
+  }
+  return times * root.px;
 }
 
 export function axis(colours: () => Paint, size: number, gap: number, more: uPlot.Axis): uPlot.Axis {

@@ -104,6 +104,7 @@ export class Plane extends XYChart {
     // A stroke for each colour: one for each point would be slow.
     const paths = new Map<string, Path2D>();
     let [px, py, before] = [NaN, NaN, -Infinity];
+    let end: Path2D | undefined;
     for (let i = Math.max(0, first); i <= last; i += 1) {
       const [nx, ny] = [plot.valToPos(x[i]!, "x", true), plot.valToPos(y[i]!, "y", true)];
       if (Number.isNaN(nx + ny)) continue;
@@ -113,9 +114,10 @@ export class Plane extends XYChart {
       if (!path) paths.set(ink, (path = new Path2D()));
       if (this.more.dots) path.rect(nx - ratio, ny - ratio, 2 * ratio, 2 * ratio);
       else if (t[i]! - before <= hole) {
-        path.moveTo(px, py);
+        if (path !== end) path.moveTo(px, py);
         path.lineTo(nx, ny);
-      }
+        end = path;
+      } else end = undefined;
       [px, py, before] = [nx, ny, t[i]!];
     }
     ctx.lineWidth = 2 * ratio;
@@ -139,8 +141,8 @@ export class Plane extends XYChart {
       car.style.rotate = `${Math.atan2(by - ay, bx - ax).toFixed(3)}rad`;
     car.dataset.dot = String(this.more.dots ?? false);
     car.style.translate = `${x.toFixed(1)}px ${y.toFixed(1)}px`;
-    const { clientWidth, clientHeight } = plot.over;
-    car.hidden = x < 0 || y < 0 || x > clientWidth || y > clientHeight;
+    const { width, height } = plot.bbox;
+    car.hidden = x < 0 || y < 0 || x > width / uPlot.pxRatio || y > height / uPlot.pxRatio;
   }
 
   private pixels(index: number): readonly [number, number] {

@@ -74,7 +74,7 @@ export class RangeChart {
   private readonly themed: () => void;
   private palette: string[] = [];
   private paint = paint();
-  private marked = { line: "", label: "" };
+  private marked = { line: "", label: "", font: "" };
   private range: Range;
   private hole_s: number;
   private marks: readonly Mark[] = [];
@@ -95,7 +95,8 @@ export class RangeChart {
     const read = (): void => {
       this.palette = options.curves.map((curve) => colour(curve.colour));
       this.paint = paint();
-      this.marked = { line: colour("--accent"), label: colour("--panel") };
+      const font = getComputedStyle(document.body).fontFamily;
+      this.marked = { line: colour("--accent"), label: colour("--panel"), font };
     };
     read();
     const colours = () => this.paint;
@@ -300,7 +301,7 @@ export class RangeChart {
   private drawMarks({ ctx, bbox, valToPos }: uPlot): void {
     const size = rem(0.8) * devicePixelRatio;
     ctx.save();
-    ctx.font = `600 ${Math.round(size * 0.9)}px ${getComputedStyle(document.body).fontFamily}`;
+    ctx.font = `600 ${Math.round(size * 0.9)}px ${this.marked.font}`;
     ctx.textAlign = "center";
     ctx.textBaseline = "top";
     const right = bbox.left + bbox.width;

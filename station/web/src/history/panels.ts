@@ -30,12 +30,23 @@ export interface PanelsOptions<D> {
   readonly changed: () => void;
 }
 
+// What is not on the screen follows once nothing has moved for this long.
+const SETTLED_MS = 150;
+
 export class Panels<D> extends Arranged<Panel<D>> {
   readonly chips = el("div", { class: "chips", role: "group", "aria-label": "Fields to chart" });
   private data: D | undefined;
   private range: Range = [0, 1];
   private at = NaN;
   private marks: readonly Mark[] = [];
+  private readonly outside = new WeakSet<Element>();
+  private readonly observer = new IntersectionObserver((entries) => {
+    for (const { target, isIntersecting } of entries) this.outside[isIntersecting ? "delete" : "add"](target);
+    this.follow(false);
+  });
+  /** The panels that show another time than the others, or another range: then it is true. */
+  private readonly late = new WeakMap<Panel<D>, boolean>();
+  private settling: number | undefined;
 
   constructor(options: PanelsOptions<D>) {
     super((key) => this.made(options.make(key)), options.most, options.changed);
@@ -58,7 +69,7 @@ export class Panels<D> extends Arranged<Panel<D>> {
 
   move(range: Range): void {
     this.range = range;
-    for (const panel of this.panels.values()) panel.move(range);
+    for (const panel of this.panels.values()) if (this.due(panel, true)) panel.move(range);
   }
 
   mark(marks: readonly Mark[]): void {
@@ -68,7 +79,8 @@ export class Panels<D> extends Arranged<Panel<D>> {
 
   point(at: number): void {
     this.at = at;
-    for (const panel of this.panels.values()) if (!panel.node.hidden) panel.point(at);
+    for (const panel of this.panels.values())
+      if (!panel.node.hidden && this.due(panel, false)) panel.point(at);
   }
 
   override set(keys: readonly string[]): void {
@@ -79,11 +91,33 @@ export class Panels<D> extends Arranged<Panel<D>> {
 
   private made(panel: Panel<D> | undefined): Panel<D> | undefined {
     if (panel) this.fill(panel);
+    if (panel) this.observer.observe(panel.node);
     return panel;
+  }
+
+  /** Whether a panel follows now: on the screen it does, elsewhere later. */
+  private due(panel: Panel<D>, moved: boolean): boolean {
+    if (!this.outside.has(panel.node)) return true;
+    this.late.set(panel, moved || (this.late.get(panel) ?? false));
+    window.clearTimeout(this.settling);
+    this.settling = window.setTimeout(() => this.follow(true), SETTLED_MS);
+    return false;
+  }
+
+  /** Let the panels follow that are late: `all` of them, or those that have come onto the screen. */
+  private follow(all: boolean): void {
+    for (const panel of this.panels.values()) {
+      const moved = this.late.get(panel);
+      if (moved === undefined || (!all && this.outside.has(panel.node))) continue;
+      this.late.delete(panel);
+      if (moved) panel.move(this.range);
+      if (!panel.node.hidden) panel.point(this.at);
+    }
   }
 
   private fill(panel: Panel<D>): void {
     if (this.data === undefined) return;
+    this.late.delete(panel);
     panel.node.hidden = !panel.set(this.data, this.range);
     if (panel.node.hidden) return;
     panel.mark?.(this.marks);

@@ -56,8 +56,9 @@ export class Result {
   private readonly comparison = new Comparison();
   private readonly reset = button("Reset", () => this.choose([]), { title: "Show the usual panels" });
   private past: Past | undefined;
-  /** Where the playhead is, and whether it is to be drawn. */
+  /** Where the playhead is, and the range that the panels do not show yet. */
   private now = NaN;
+  private moved: Range | undefined;
   private drawing = false;
 
   constructor(private readonly options: ResultOptions) {
@@ -134,6 +135,7 @@ export class Result {
     if (drive) this.pictures.set(drive);
     this.comparison.of(fields.map((field) => [field, past.spec(field)]));
     this.playback.set(this.times);
+    this.moved = undefined;
     this.arrange(range);
     this.now = this.rest;
     this.draw();
@@ -146,9 +148,10 @@ export class Result {
     this.node.hidden = true;
   }
 
-  /** Show another range of the same samples. */
+  /** Show another range of the same samples, with the next picture. */
   move(range: Range): void {
-    this.panels.move(range);
+    this.moved = range;
+    this.drawSoon();
   }
 
   /** Mark times on the charts. */
@@ -255,6 +258,10 @@ export class Result {
   /** Move the playhead: in every panel, in the table and on the slider, with the next picture. */
   private point(at: number): void {
     this.now = at;
+    this.drawSoon();
+  }
+
+  private drawSoon(): void {
     if (this.drawing) return;
     this.drawing = true;
     requestAnimationFrame(() => this.draw());
@@ -262,7 +269,9 @@ export class Result {
 
   private draw(): void {
     this.drawing = false;
-    const { past, now } = this;
+    const { past, now, moved } = this;
+    if (moved) this.panels.move(moved);
+    this.moved = undefined;
     if (!past || Number.isNaN(now)) return;
     this.panels.point(now);
     const drive = past.drives.get(past.main);

@@ -11,6 +11,8 @@ import type { Past } from "./past";
 const TABLE = "table";
 // Rows that are in the page at a time: around the playhead, or the first in the order of a column.
 const SHOWN = 100;
+// Rows that fly by cannot be read: they are written so often.
+const AGAIN_MS = 100;
 
 export const rowsKey = (stream: string): string => `${TABLE}:${stream}`;
 export const rowsStream = (key: string): string | undefined =>
@@ -40,6 +42,10 @@ export class RowsPanel implements Panel<Past> {
   /** The rows of the range, in their order, and the first of those that are in the page. */
   private order: number[] = [];
   private from = 0;
+  /** The lines of the table, which are written again for other rows. */
+  private lines: { readonly node: HTMLElement; readonly cells: readonly Text[] }[] = [];
+  private lit: HTMLElement | undefined;
+  private filling: number | undefined;
   private sort: { readonly column: string; readonly down: boolean } = { column: "", down: false };
   private index = -1;
   private keyed = false;
@@ -53,9 +59,9 @@ export class RowsPanel implements Panel<Past> {
     setAttribute(this.box, "aria-label", `Rows of ${stream}`);
     this.node = panel(this.title, "rows-panel", [this.note.node, this.said.node, copy], this.box);
     this.body.addEventListener("click", ({ target }) => {
-      const at = Number((target as Element).closest("tr")?.dataset.row ?? NaN);
-      if (Number.isNaN(at)) return;
-      touch.point(this.times[at]!);
+      const line = this.lines.findIndex(({ node }) => node.contains(target as Element));
+      if (line < 0) return;
+      touch.point(this.times[this.order[this.from + line]!]!);
       touch.pick();
     });
     this.box.addEventListener("keydown", (event) => this.key(event));
@@ -74,13 +80,35 @@ export class RowsPanel implements Panel<Past> {
       return { name, spec: past.spec(key), values: drive.fields[name]!.mean };
     });
     this.index = -1;
+    this.range = range;
+    this.lines = [];
     this.heading();
-    this.move(range);
+    this.arrange();
+    this.fill(0);
     return true;
   }
 
   move(range: Range): void {
     this.range = range;
+    this.fillSoon();
+  }
+
+  point(at: number): void {
+    this.index = this.times.length > 0 ? lastAt(this.times, at) : -1;
+    const place = this.order.indexOf(this.index);
+    // In the order of time the rows go along with the playhead.
+    const outside = place < this.from || place >= this.from + SHOWN;
+    if (place >= 0 && outside && !this.sort.column) this.fillSoon();
+    this.light();
+  }
+
+  destroy(): void {
+    window.clearTimeout(this.filling);
+    this.node.remove();
+  }
+
+  /** Put the rows of the range into their order. */
+  private arrange(): void {
     const inside = (at: number): boolean => this.range[0] <= at && at <= this.range[1];
     this.order = [...this.times.keys()].filter((row) => inside(this.times[row]!));
     const column = this.columns.find(({ name }) => name === this.sort.column);
@@ -90,56 +118,55 @@ export class RowsPanel implements Panel<Past> {
         (a, b) => sign * compared(column.values[a] ?? null, column.values[b] ?? null, sign) || a - b,
       );
     else if (this.sort.down) this.order.reverse();
-    this.fill(0);
     const shown = Math.min(SHOWN, this.order.length);
     this.note.set(
       shown < this.order.length ? `${shown} of ${number(this.order.length)} rows` : `${shown} rows`,
     );
   }
 
-  point(at: number): void {
-    this.index = this.times.length > 0 ? lastAt(this.times, at) : -1;
-    const place = this.order.indexOf(this.index);
-    // In the order of time the rows go along with the playhead.
-    const outside = place < this.from || place >= this.from + SHOWN;
-    if (place >= 0 && outside && !this.sort.column) this.fill(place - SHOWN / 2);
-    this.light();
-  }
-
-  destroy(): void {
-    this.node.remove();
+  private fillSoon(): void {
+    this.filling ??= window.setTimeout(() => {
+      this.filling = undefined;
+      this.arrange();
+      this.fill(this.sort.column ? 0 : this.order.indexOf(this.index) - SHOWN / 2);
+    }, AGAIN_MS);
   }
 
   private fill(first: number): void {
     this.from = Math.max(0, Math.min(first, this.order.length - SHOWN));
-    this.body.replaceChildren(
-      ...this.order
-        .slice(this.from, this.from + SHOWN)
-        .map((row) =>
-          el(
-            "tr",
-            { "data-row": String(row) },
-            el(
-              "th",
-              { scope: "row", class: "num" },
-              dayTime(this.times[row]!, { fractionalSecondDigits: 3 }),
-            ),
-            ...this.columns.map(({ values, spec }) => el("td", { class: "num" }, write(values[row], spec))),
-          ),
-        ),
-    );
+    const rows = this.order.slice(this.from, this.from + SHOWN);
+    while (this.lines.length < rows.length) this.lines.push(this.line());
+    rows.forEach((row, i) => {
+      const [time, ...cells] = this.lines[i]!.cells;
+      time!.set(dayTime(this.times[row]!, { fractionalSecondDigits: 3 }));
+      this.columns.forEach(({ values, spec }, c) => cells[c]!.set(write(values[row], spec)));
+    });
+    const nodes = this.lines.slice(0, rows.length).map(({ node }) => node);
+    if (nodes.length !== this.body.childElementCount || nodes[0] !== this.body.firstElementChild)
+      this.body.replaceChildren(...nodes);
     this.light();
+  }
+
+  private line(): (typeof this.lines)[number] {
+    const time = new Text("num", "th", { scope: "row" });
+    const cells = [time, ...this.columns.map(() => new Text("num", "td"))];
+    return { node: el("tr", {}, ...cells.map(({ node }) => node)), cells };
   }
 
   /** Show where the playhead is. */
   private light(): void {
-    this.body.querySelector("[aria-current]")?.removeAttribute("aria-current");
-    const row = this.body.children[this.order.indexOf(this.index) - this.from];
-    if (!row) return;
-    row.setAttribute("aria-current", "true");
-    // The page itself does not move for it.
+    const line = this.lines[this.order.indexOf(this.index) - this.from]?.node;
+    const lit = line?.isConnected ? line : undefined;
+    if (lit !== this.lit) this.lit?.removeAttribute("aria-current");
+    this.lit = lit;
+    lit?.setAttribute("aria-current", "true");
+    // It reads the layout, so once all panels have moved.
+    if (lit) queueMicrotask(() => this.reveal(lit));
+  }
+
+  /** Scroll to a line; the page itself does not move for it. */
+  private reveal({ offsetTop: top, offsetHeight: height }: HTMLElement): void {
     const { box } = this;
-    const [top, height] = [(row as HTMLElement).offsetTop, (row as HTMLElement).offsetHeight];
     const head = this.head.offsetHeight;
     if (top - head < box.scrollTop || top + height > box.scrollTop + box.clientHeight)
       box.scrollTop = top - box.clientHeight / 2;
@@ -163,7 +190,8 @@ export class RowsPanel implements Panel<Past> {
     const focused = [...this.head.children].findIndex((each) => each.contains(document.activeElement));
     this.heading();
     (this.head.children[focused]?.firstElementChild as HTMLElement | null)?.focus();
-    this.move(this.range);
+    this.arrange();
+    this.fill(0);
     this.box.scrollTop = 0;
   }
 
