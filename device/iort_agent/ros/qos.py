@@ -64,8 +64,3 @@ def request(
         transient_local = config.durability == TRANSIENT_LOCAL
     depth = config.depth or (DEPTH_OF_LARGE if large else DEPTH)
     return Request(Offer(reliable, transient_local), depth, patient and depth >= DEPTH)
-
-
-def fits(asked: Offer, offer: Offer) -> bool:
-    """Whether the middleware connects a request and an offer."""
-    return offer.reliable >= asked.reliable and offer.transient_local >= asked.transient_local

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from iort_agent.errors import SourceError
-from iort_agent.ros.qos import Offer, Request, fits
+from iort_agent.ros.qos import Offer, Request
 from iort_agent.ros.ros1_types import OnTrigger
 from iort_agent.ros.ros2_session import INCOMPATIBLE, Endpoint, Take, Told
 from iort_agent.ros.ros2_types import Installed, Types
@@ -16,6 +16,11 @@ from iort_agent.ros.ros2_types import Installed, Types
 RELIABLE = Offer(reliable=True, transient_local=False)
 LATCHED = Offer(reliable=True, transient_local=True)
 BEST_EFFORT = Offer(reliable=False, transient_local=False)
+
+
+def fits(asked: Offer, offer: Offer) -> bool:
+    """Whether the middleware connects a request and an offer."""
+    return offer.reliable >= asked.reliable and offer.transient_local >= asked.transient_local
 
 
 @dataclass(eq=False)

@@ -12,14 +12,14 @@ import pytest
 
 from iort_agent.common.threads import SystemClock
 from iort_agent.errors import SourceError
-from iort_agent.ros.qos import DEPTH, DEPTH_OF_LARGE, Offer, QosConfig, fits, request
+from iort_agent.ros.qos import DEPTH, DEPTH_OF_LARGE, Offer, QosConfig, request
 from iort_agent.ros.ros2_node import Node
 from iort_agent.ros.ros2_session import LOST
 from iort_agent.ros.ros2_topic import Topic
 from iort_agent.sources.intake import Intake, TopicConfig
 from testkit.agent import ManualClock
 from testkit.waiting import GUARD_S, until
-from tests.unit.agent.ros2_graph import BEST_EFFORT, LATCHED, RELIABLE, FakeGraph, FakeTypes
+from tests.unit.agent.ros2_graph import BEST_EFFORT, LATCHED, RELIABLE, FakeGraph, FakeTypes, fits
 
 IMU, IMAGE, LOST_TYPE = "a_msgs/msg/Imu", "a_msgs/msg/Image", "b_msgs/msg/Lost"
 TEXTS = {IMU: "float64 x\n", IMAGE: "uint8[] data\n"}
