@@ -1,5 +1,5 @@
 """Notes in the files' bucket what was imported, by the recording's content: a second import of it does
-nothing, and an interrupted one goes on in the same way."""
+nothing, and an interrupted one goes on in the same way. And, by robot, which imports are under way."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from iort_contract.objects import CHANGED, code_of
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
-_PREFIX = "imports/"
+# A note's name is a content's hash, or begins with the second one and has a robot.
+_PREFIX, _UNDER_WAY = "imports/", "under-way/"
 _CHUNK = 4 * 1024 * 1024
-_ATTEMPTS = 3
+_ATTEMPTS = 10
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,12 @@ class Import:
     samples: int = 0
     done_ms: int = 0
     end: str = ""
+
+
+def shared(one: Import, other: Import) -> list[str]:
+    """The streams that two imports have at the same time."""
+    at_once = one.from_us < other.to_us and other.from_us < one.to_us
+    return sorted(set(one.streams) & set(other.streams)) if at_once else []
 
 
 def content_of(files: Sequence[Path], progress: Callable[[float], None]) -> str:
@@ -61,10 +68,10 @@ class Ledger:
         """The imports of a recording."""
         return self._read(content)[0]
 
-    def _read(self, content: str) -> tuple[list[Import], dict[str, Any]]:
+    def _read(self, name: str) -> tuple[list[Import], dict[str, Any]]:
         """The imports, and the condition for writing over what was read."""
         try:
-            answer = self._client.get_object(Bucket=self._bucket, Key=_key(content))
+            answer = self._client.get_object(Bucket=self._bucket, Key=_key(name))
         except ClientError as error:
             if code_of(error) in {"NoSuchKey", "404"}:
                 return [], {"IfNoneMatch": "*"}
@@ -75,19 +82,41 @@ class Ledger:
             return imports, {"IfMatch": answer["ETag"]}
         except (ContractError, KeyError, TypeError, ValueError) as error:
             raise StationError(
-                f"{_key(content)} in the files' bucket is no note of an import: {error}"
+                f"{_key(name)} in the files' bucket is no note of an import: {error}"
             ) from error
 
     def note(self, content: str, one: Import) -> None:
         """Note an import, in place of what was noted of its robot and run."""
+        self._change(content, one, lambda others: [*others, one])
+
+    def begin(self, one: Import, *, overlap: bool) -> Import | None:
+        """Note that an import is under way, unless it overlaps another one that is: returns that one. Two
+        that begin at once cannot miss each other."""
+        against: list[Import] = []
+
+        def change(others: list[Import]) -> list[Import] | None:
+            against[:] = () if overlap else [each for each in others if shared(each, one)]
+            return None if against else [*others, one]
+
+        self._change(_UNDER_WAY + one.robot, one, change)
+        return against[0] if against else None
+
+    def end(self, one: Import) -> None:
+        """Note that an import is under way no longer."""
+        self._change(_UNDER_WAY + one.robot, one, lambda others: others)
+
+    def _change(self, name: str, one: Import, change: Callable[[list[Import]], list[Import] | None]) -> None:
+        """Change the imports of a note, given those but ``one``; None leaves them."""
         for last in (False,) * _ATTEMPTS + (True,):
-            there, condition = self._read(content)
-            others = [each for each in there if (each.robot, each.run) != (one.robot, one.run)]
-            body = json.dumps({"imports": [asdict(each) for each in (*others, one)]}, indent=1)
+            there, condition = self._read(name)
+            after = change([each for each in there if (each.robot, each.run) != (one.robot, one.run)])
+            if after is None:
+                return
+            body = json.dumps({"imports": [asdict(each) for each in after]}, indent=1)
             try:
                 self._client.put_object(
                     Bucket=self._bucket,
-                    Key=_key(content),
+                    Key=_key(name),
                     Body=body.encode(),
                     ContentType="application/json",
                     **condition,
@@ -105,5 +134,5 @@ class Ledger:
         self.note(content, replace(one, samples=samples, done_ms=now_ms, end=end))
 
 
-def _key(content: str) -> str:
-    return f"{_PREFIX}{content}.json"
+def _key(name: str) -> str:
+    return f"{_PREFIX}{name}.json"

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -29,7 +29,7 @@ from iort_station.data.recorded import Recorded
 from iort_station.errors import StationError, UsageError
 from iort_station.imports.batches import FIRST_US
 from iort_station.imports.choice import Choice, TopicChoice
-from iort_station.imports.ledger import Import, Ledger, content_of
+from iort_station.imports.ledger import Import, Ledger, content_of, shared
 from iort_station.imports.stores import ARCHIVE, TABLE
 from iort_station.times import iso
 
@@ -271,7 +271,7 @@ def check(
                 _of_another(plan, robot, imports)
                 or _twice(plan, robot, imports)
                 or _among(plan, accepted)
-                or ("" if plan.begun else _recorded(cloud, robot, plan))
+                or ("" if plan.begun else _recorded(cloud, robot, plan, {plan.run}))
             )
         if not plan.refused:
             accepted.append(plan)
@@ -303,14 +303,29 @@ def _twice(plan: Plan, robot: str, imports: Sequence[Import]) -> str:
 
 def _among(plan: Plan, others: Sequence[Plan]) -> str:
     for one in others:
-        both = sorted(set(one.streams) & set(plan.streams))
-        if both and one.first_us < plan.last_us and plan.first_us < one.last_us:
+        if both := shared(one.entry(""), plan.entry("")):
             return f"{plan.path}: overlaps {one.path} in {', '.join(both)}: leave one; --overlap imports both"
     return ""
 
 
-def _recorded(cloud: Cloud, robot: str, plan: Plan) -> str:
-    """Whether the robot has recorded in the same time."""
+def begin(cloud: Cloud, robot: str, plan: Plan, own: Collection[str], *, overlap: bool) -> str:
+    """Begin a plan's import, unless another one imports the same time, or has done so since `check`: returns
+    why not. ``own`` are the runs that are imported together."""
+    ledger, entry = Ledger(cloud), plan.entry(robot)
+    if (other := ledger.begin(entry, overlap=overlap)) is not None:
+        both = ", ".join(shared(other, entry))
+        return (
+            f"{plan.path}: overlaps {other.name} in {both}, whose import has begun: let it end, or do it "
+            "again if it was interrupted; --overlap imports both"
+        )
+    if not (overlap or plan.begun) and (why := _recorded(cloud, robot, plan, own)):
+        ledger.end(entry)
+        return why
+    return ""
+
+
+def _recorded(cloud: Cloud, robot: str, plan: Plan, own: Collection[str]) -> str:
+    """Whether the robot has recorded in the same time, by other runs than its ``own``."""
     for stream in plan.streams:
         if stream in OWN_STREAMS:
             continue
@@ -320,7 +335,7 @@ def _recorded(cloud: Cloud, robot: str, plan: Plan) -> str:
                 one = batch_id(item[BATCH]["S"])
             except ContractError:
                 continue
-            if one.boot != plan.run:
+            if one.boot not in own:
                 return (
                     f"{plan.path}: {robot} has {stream} of this time already, at {iso(one.t_us)} by the run "
                     f"{one.boot}: is it the same drive? --overlap imports it beside that"

@@ -18,7 +18,7 @@ from iort_station.fleet import registry
 from iort_station.imports.attach import Attachments
 from iort_station.imports.batches import FIRST_US, Counts, Run, Times, selected, time_of
 from iort_station.imports.ledger import Ledger
-from iort_station.imports.plan import Plan, last_us
+from iort_station.imports.plan import Plan, begin, last_us
 from iort_station.imports.stores import ARCHIVE, ArchiveStore, Store, TableStore
 
 # Messages of an hour may come so much later: a header's stamp is believed for an hour.
@@ -52,9 +52,11 @@ def run(
     retention_s: int,
     units_per_s: int,
     every_s: float = 1.0,
+    overlap: bool = False,
     progress: Callable[[int], None] = lambda _messages: None,
 ) -> list[Outcome]:
-    """Import the plans that go on, in the order of their times; ``progress`` takes further messages."""
+    """Import the plans that go on, in the order of their times; ``progress`` takes further messages. A plan
+    is refused if another import has come before it, unless they may ``overlap``."""
     ledger, going = Ledger(cloud), [plan for plan in plans if plan.goes_on]
     topics = _Topics(cloud, robot)
     outcomes: list[Outcome] = []
@@ -64,21 +66,25 @@ def run(
         for outcome in unwritten:
             plan = outcome.plan
             ledger.done(plan.content, plan.entry(robot), outcome.samples, outcome.end)
+            ledger.end(plan.entry(robot))
         unwritten.clear()
 
+    own = {plan.run for plan in going}
     with closing(ArchiveStore(cloud, robot)) as archive:
         for number, plan in enumerate(going):
-            ledger.note(plan.content, plan.entry(robot))
-            store: Store = archive
-            if plan.store != ARCHIVE:
-                store = TableStore(cloud, units_per_s, again=plan.begun)
-            times = Times(FIRST_US, last_us(), plan.shift_us)
-            one = Run(topics, plan.run, store, times, retention_s)
-            attachments = Attachments(cloud, robot, every_s)
-            outcome = _Importing(Outcome(plan, one.counts), one, store, attachments, progress).all()
-            outcomes.append(outcome)
-            unwritten.append(outcome)
-            registry.note_streams(cloud, robot, [*plan.streams, TYPES_STREAM])
+            plan.refused = begin(cloud, robot, plan, own, overlap=overlap)
+            if not plan.refused:
+                ledger.note(plan.content, plan.entry(robot))
+                store: Store = archive
+                if plan.store != ARCHIVE:
+                    store = TableStore(cloud, units_per_s, again=plan.begun)
+                times = Times(FIRST_US, last_us(), plan.shift_us)
+                one = Run(topics, plan.run, store, times, retention_s)
+                attachments = Attachments(cloud, robot, every_s)
+                outcome = _Importing(Outcome(plan, one.counts), one, store, attachments, progress).all()
+                outcomes.append(outcome)
+                unwritten.append(outcome)
+                registry.note_streams(cloud, robot, [*plan.streams, TYPES_STREAM])
             # An hour that the next one is in, too, is written once.
             following = going[number + 1 :]
             before = hour_of(following[0].first_us) if following else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -513,19 +514,20 @@ def test_an_import_that_was_killed_before_the_row_goes_on(
 
 HOLDS = {
     # Where an import is held: the other one then runs as far as its own hold, or to its end.
-    "before its object": ("s3", "PutObject", "archive/"),
-    "before its row": ("dynamodb", "PutItem", ""),
-    "before its note": ("s3", "PutObject", "imports/"),
+    "before it is under way": ("s3", "PutObject", r"imports/under-way/"),
+    "before its note": ("s3", "PutObject", r"imports/[0-9a-f]{64}\.json"),
+    "before its object": ("s3", "PutObject", r"archive/"),
+    "before its row": ("dynamodb", "PutItem", r""),
 }
 
 
 def held(cloud: Cloud, where: str, act: Callable[[], None]) -> Cloud:
     """The cloud with clients of its own, which ``act`` once before the first such call."""
-    own, (service, operation, prefix) = replace(cloud), HOLDS[where]
+    own, (service, operation, key) = replace(cloud), HOLDS[where]
     acted: list[bool] = []
 
     def hold(params: dict[str, Any], **_other: Any) -> None:
-        if params.get("Key", "").startswith(prefix) and not acted:
+        if not acted and (service != "s3" or re.match(key, params["Key"])):
             acted.append(True)
             act()
 
@@ -545,6 +547,8 @@ def held(cloud: Cloud, where: str, act: Callable[[], None]) -> Cloud:
         ("before its object", "", False, False),
         ("before its row", "before its row", True, False),
         ("before its note", "", True, False),
+        ("before it is under way", "", True, False),
+        ("before it is under way", "", False, False),
     ],
 )
 def test_two_imports_at_once_lose_nothing(
@@ -601,6 +605,46 @@ def test_two_imports_at_once_lose_nothing(
         assert one.complete
         assert [each.samples for each in one.runs] == [COUNTS[stream]] * (2 + there - same)
     assert "nothing to do" in iort("import", *given, robot).output
+
+
+@pytest.mark.parametrize(
+    ("first", "refused", "words"),
+    [
+        # The second one comes before the first one has stored anything, or before it has said that it will.
+        ("before its object", 1, r"overlaps drive\.bag in .*vesc, whose import has begun: let it end"),
+        ("before it is under way", 0, "has imu-data of this time already"),
+    ],
+)
+def test_of_two_imports_of_the_same_time_at_once_one_is_refused(
+    embedded: EmbeddedCloud,
+    importer: tuple[str, Iort],
+    tmp_path: Path,
+    *,
+    first: str,
+    refused: int,
+    words: str,
+) -> None:
+    (robot, iort), cloud, start_ns = importer, embedded.cloud, fresh_ns()
+    paths = [made(tmp_path, kind, start_ns=start_ns) for kind in ("bag", "mcap")]
+    plans = [look([path], Choice(), start_us=None) for path in paths]
+    for some in plans:
+        check(cloud, robot, some, archive=True, overlap=False, retention_s=86_400)
+    outcomes: dict[int, list[Any]] = {}
+
+    def import_(number: int, by: Cloud) -> None:
+        outcomes[number] = run(by, robot, plans[number], retention_s=86_400, units_per_s=500)
+
+    import_(0, held(cloud, first, lambda: import_(1, replace(cloud))))
+    assert [len(outcomes[number]) for number in (0, 1)] == [int(number != refused) for number in (0, 1)]
+    assert re.search(words, plans[refused][0].refused)
+    for stream, one in audited(cloud, robot).items():
+        assert one.complete
+        assert [each.samples for each in one.runs] == [COUNTS[stream]]
+    # What was refused stands in nobody's way.
+    (late,) = plans[refused]
+    assert "of this time already" in iort("import", late.path, robot, status=1).output
+    iort("import", late.path, robot, "--overlap")
+    assert iort_of(embedded, "archive", "verify", robot).exit_code == 0
 
 
 def test_a_drive_on_the_border_of_the_retention_goes_into_the_archive(

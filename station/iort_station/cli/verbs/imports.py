@@ -108,6 +108,7 @@ def import_(
                 for one in plans:
                     _show_plan(one)
             outcomes: list[Outcome] = []
+            going = [one for one in plans if one.goes_on]
             if not dry_run:
                 total = sum(sum(one.counts.values()) for one in plans if one.goes_on)
                 with bar("importing", total, MofNCompleteColumn()) as progress:
@@ -118,6 +119,7 @@ def import_(
                         retention_s=days * 86_400,
                         units_per_s=units,
                         every_s=choice.large_every_s,
+                        overlap=overlap,
                         progress=progress,
                     )
     except OSError as error:
@@ -134,6 +136,10 @@ def import_(
     elif cost is not None:
         _show_cost(cost, days)
     else:
+        for one in going:
+            # Another import has come before it.
+            if one.refused:
+                _show_plan(one)
         for outcome in outcomes:
             _show_outcome(robot, outcome)
     raise typer.Exit(1 if any(one.refused for one in plans) else 0)
