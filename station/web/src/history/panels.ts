@@ -32,6 +32,9 @@ export interface PanelsOptions<D> {
 
 // What is not on the screen follows once nothing has moved for this long.
 const SETTLED_MS = 150;
+// A frame that took longer had too many panels to draw. The panel under the pointer and another one are always drawn.
+const SLOW_MS = 25;
+const LEAST_A_FRAME = 2;
 
 export class Panels<D> extends Arranged<Panel<D>> {
   readonly chips = el("div", { class: "chips", role: "group", "aria-label": "Fields to chart" });
@@ -42,11 +45,15 @@ export class Panels<D> extends Arranged<Panel<D>> {
   private readonly outside = new WeakSet<Element>();
   private readonly observer = new IntersectionObserver((entries) => {
     for (const { target, isIntersecting } of entries) this.outside[isIntersecting ? "delete" : "add"](target);
-    this.follow(false);
+    this.followSoon();
   });
-  /** The panels that show another time than the others, or another range: then it is true. */
-  private readonly late = new WeakMap<Panel<D>, boolean>();
+  /** The panels that show another time than the others, or another range, which is true then: the latest last. */
+  private readonly late = new Map<Panel<D>, boolean>();
+  private following: number | undefined;
   private settling: number | undefined;
+  /** How many panels are drawn in a frame, and when the last ones were. */
+  private aFrame = Infinity;
+  private drawnAt = NaN;
 
   constructor(options: PanelsOptions<D>) {
     super((key) => this.made(options.make(key)), options.most, options.changed);
@@ -67,9 +74,11 @@ export class Panels<D> extends Arranged<Panel<D>> {
     this.chips.replaceChildren();
   }
 
+  /** Show another range, with the next frames. */
   move(range: Range): void {
     this.range = range;
-    for (const panel of this.panels.values()) if (this.due(panel, true)) panel.move(range);
+    for (const panel of this.panels.values()) this.late.set(panel, true);
+    this.followSoon();
   }
 
   mark(marks: readonly Mark[]): void {
@@ -80,7 +89,9 @@ export class Panels<D> extends Arranged<Panel<D>> {
   point(at: number): void {
     this.at = at;
     for (const panel of this.panels.values())
-      if (!panel.node.hidden && this.due(panel, false)) panel.point(at);
+      if (this.outside.has(panel.node)) this.late.set(panel, this.late.get(panel) ?? false);
+      else if (!panel.node.hidden) panel.point(at);
+    if (this.late.size > 0) this.followSoon();
   }
 
   override set(keys: readonly string[]): void {
@@ -95,24 +106,39 @@ export class Panels<D> extends Arranged<Panel<D>> {
     return panel;
   }
 
-  /** Whether a panel follows now: on the screen it does, elsewhere later. */
-  private due(panel: Panel<D>, moved: boolean): boolean {
-    if (!this.outside.has(panel.node)) return true;
-    this.late.set(panel, moved || (this.late.get(panel) ?? false));
-    window.clearTimeout(this.settling);
-    this.settling = window.setTimeout(() => this.follow(true), SETTLED_MS);
-    return false;
+  private followSoon(): void {
+    this.following ??= requestAnimationFrame((now) => {
+      this.following = undefined;
+      this.follow(now);
+    });
   }
 
-  /** Let the panels follow that are late: `all` of them, or those that have come onto the screen. */
-  private follow(all: boolean): void {
-    for (const panel of this.panels.values()) {
-      const moved = this.late.get(panel);
-      if (moved === undefined || (!all && this.outside.has(panel.node))) continue;
-      this.late.delete(panel);
-      if (moved) panel.move(this.range);
-      if (!panel.node.hidden) panel.point(this.at);
+  /** Let late panels follow: on the screen as many as a frame has time for, by turns; elsewhere at rest. */
+  private follow(now: number): void {
+    const took = now - this.drawnAt;
+    if (took > SLOW_MS) this.aFrame = Math.max(LEAST_A_FRAME, Math.min(this.aFrame, this.panels.size) / 2);
+    else if (took <= SLOW_MS) this.aFrame = Math.min(this.panels.size, this.aFrame + 0.1);
+    const seen = [...this.late.keys()].filter(({ node }) => !this.outside.has(node));
+    const pointed = seen.filter(({ node }) => node.matches(":hover"));
+    for (const panel of [...new Set([...pointed, ...seen])].slice(0, this.aFrame)) this.catchUp(panel);
+    this.drawnAt = seen.length > 0 ? now : NaN;
+    // Once more, to see how long these took.
+    if (seen.length > 0) this.followSoon();
+    else if (this.late.size > 0) {
+      window.clearTimeout(this.settling);
+      this.settling = window.setTimeout(() => {
+        for (const panel of this.late.keys()) this.catchUp(panel);
+      }, SETTLED_MS);
     }
+  }
+
+  private catchUp(panel: Panel<D>): void {
+    const moved = this.late.get(panel);
+    this.late.delete(panel);
+    // It may have been closed meanwhile.
+    if (!panel.node.isConnected) return;
+    if (moved) panel.move(this.range);
+    if (!panel.node.hidden) panel.point(this.at);
   }
 
   private fill(panel: Panel<D>): void {

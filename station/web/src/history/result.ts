@@ -56,9 +56,8 @@ export class Result {
   private readonly comparison = new Comparison();
   private readonly reset = button("Reset", () => this.choose([]), { title: "Show the usual panels" });
   private past: Past | undefined;
-  /** Where the playhead is, and the range that the panels do not show yet. */
+  /** Where the playhead is, and whether it is to be drawn. */
   private now = NaN;
-  private moved: Range | undefined;
   private drawing = false;
 
   constructor(private readonly options: ResultOptions) {
@@ -135,7 +134,6 @@ export class Result {
     if (drive) this.pictures.set(drive);
     this.comparison.of(fields.map((field) => [field, past.spec(field)]));
     this.playback.set(this.times);
-    this.moved = undefined;
     this.arrange(range);
     this.now = this.rest;
     this.draw();
@@ -148,10 +146,9 @@ export class Result {
     this.node.hidden = true;
   }
 
-  /** Show another range of the same samples, with the next picture. */
+  /** Show another range of the same samples. */
   move(range: Range): void {
-    this.moved = range;
-    this.drawSoon();
+    this.panels.move(range);
   }
 
   /** Mark times on the charts. */
@@ -258,10 +255,6 @@ export class Result {
   /** Move the playhead: in every panel, in the table and on the slider, with the next picture. */
   private point(at: number): void {
     this.now = at;
-    this.drawSoon();
-  }
-
-  private drawSoon(): void {
     if (this.drawing) return;
     this.drawing = true;
     requestAnimationFrame(() => this.draw());
@@ -269,9 +262,7 @@ export class Result {
 
   private draw(): void {
     this.drawing = false;
-    const { past, now, moved } = this;
-    if (moved) this.panels.move(moved);
-    this.moved = undefined;
+    const { past, now } = this;
     if (!past || Number.isNaN(now)) return;
     this.panels.point(now);
     const drive = past.drives.get(past.main);
