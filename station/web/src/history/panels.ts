@@ -34,7 +34,7 @@ export interface PanelsOptions<D> {
 const SETTLED_MS = 150;
 // A frame that took longer had too many panels to draw. The panel under the pointer and another one are always drawn.
 const SLOW_MS = 25;
-const LEAST_A_FRAME = 2;
+const LEAST_PER_FRAME = 2;
 
 export class Panels<D> extends Arranged<Panel<D>> {
   readonly chips = el("div", { class: "chips", role: "group", "aria-label": "Fields to chart" });
@@ -52,7 +52,7 @@ export class Panels<D> extends Arranged<Panel<D>> {
   private following: number | undefined;
   private settling: number | undefined;
   /** How many panels are drawn in a frame, and when the last ones were. */
-  private aFrame = Infinity;
+  private perFrame = Infinity;
   private drawnAt = NaN;
 
   constructor(options: PanelsOptions<D>) {
@@ -116,11 +116,12 @@ export class Panels<D> extends Arranged<Panel<D>> {
   /** Let late panels follow: on the screen as many as a frame has time for, by turns; elsewhere at rest. */
   private follow(now: number): void {
     const took = now - this.drawnAt;
-    if (took > SLOW_MS) this.aFrame = Math.max(LEAST_A_FRAME, Math.min(this.aFrame, this.panels.size) / 2);
-    else if (took <= SLOW_MS) this.aFrame = Math.min(this.panels.size, this.aFrame + 0.1);
+    if (took > SLOW_MS)
+      this.perFrame = Math.max(LEAST_PER_FRAME, Math.min(this.perFrame, this.panels.size) / 2);
+    else if (took <= SLOW_MS) this.perFrame = Math.min(this.panels.size, this.perFrame + 0.1);
     const seen = [...this.late.keys()].filter(({ node }) => !this.outside.has(node));
     const pointed = seen.filter(({ node }) => node.matches(":hover"));
-    for (const panel of [...new Set([...pointed, ...seen])].slice(0, this.aFrame)) this.catchUp(panel);
+    for (const panel of [...new Set([...pointed, ...seen])].slice(0, this.perFrame)) this.catchUp(panel);
     this.drawnAt = seen.length > 0 ? now : NaN;
     // Once more, to see how long these took.
     if (seen.length > 0) this.followSoon();
