@@ -44,9 +44,10 @@ def workspace(ros2: Ros2, request: pytest.FixtureRequest, tmp_path_factory: pyte
 
 
 def without_checkout(environment: dict[str, str]) -> dict[str, str]:
-    """The environment with the agent's requirements, and without the agent of this checkout."""
+    """The environment with the agent's requirements, and without the agent of this checkout; what the other
+    nodes of a test import stands beside the agent's folder, not in it."""
     paths = environment["PYTHONPATH"].split(os.pathsep)
-    others = [path for path in paths if path and not Path(path).is_relative_to(ROOT)]
+    others = [path for path in paths if path and ROOT not in Path(path).parents]
     path = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
     requirements = sysconfig.get_path("purelib")
     return {**environment, "PATH": path, "PYTHONPATH": os.pathsep.join([*others, requirements])}
