@@ -2,12 +2,13 @@
 
 Exactly once: a run writes the object only over the version that it has seen, and the manifest's row only over
 the content that it has seen. A run that is killed leaves the row as it was; the next one writes the object
-again.
+again. An object that no row names yet, of an import that writes at the same time, goes into what is written.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -34,6 +35,7 @@ from iort_contract.archive import (
 from iort_contract.dynamodb import Item, starting_between
 from iort_contract.topics import parse_topic
 
+_log = logging.getLogger(__name__)
 # An item may go a little before its time, by another clock.
 _MARGIN_S = 3600
 
@@ -42,11 +44,13 @@ def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHou
     """Archive what the table has of an hour; returns the manifest's row, None if there is nothing."""
     topic, hour = parse_topic(pending.topic), parse_hour(pending.period)
     due_ms = archive.marks.due_ms(pending)
-    row = archive.row(pending.topic, hour)
     key, refused = hour_key(topic, hour), refused_key(topic, hour)
+    # Before the row, which may be newer than these versions and never older.
     versions = {one: archive.objects.version(one) for one in (key, refused)}
+    row = archive.row(pending.topic, hour)
+    unnamed = "" if versions[key] is None or (row is not None and row.key == key) else key
     with ExitStack() as files:
-        file, set_aside, written = _write(archive, pending, row, now_ms, files)
+        file, set_aside, written = _write(archive, pending, row, now_ms, files, unnamed=unnamed)
         aside = sum(written.refused.values())
         if written.batches + aside and (row is None or row.content != written.content):
             sha256, size = "", 0
@@ -89,22 +93,30 @@ def archive_hour(archive: Archive, pending: Pending, now_ms: int) -> ArchivedHou
 
 
 def _write(
-    archive: Archive, pending: Pending, row: ArchivedHour | None, now_ms: int, files: ExitStack
+    archive: Archive,
+    pending: Pending,
+    row: ArchivedHour | None,
+    now_ms: int,
+    files: ExitStack,
+    *,
+    unnamed: str,
 ) -> tuple[IO[bytes], IO[bytes], Written]:
     """Write an hour's file, and that of refused items.
 
-    What the table no longer has comes from the archive, which must not shrink.
+    What the table no longer has comes from the archive, which must not shrink. ``unnamed`` is the key of an
+    object of the hour that its row does not name: an import has written it, and not the row yet.
     """
     topic, hour = pending.topic, parse_hour(pending.period)
-    with_archived = row is not None and 0 < row.first_expires_s <= now_ms / 1000 + _MARGIN_S
+    is_expiring = row is not None and 0 < row.first_expires_s <= now_ms / 1000 + _MARGIN_S
+    with_archived = is_expiring or bool(unnamed)
     while True:
         into, refused, scratch = [files.enter_context(TemporaryFile()) for _ in range(3)]  # noqa: SIM115 - it is
         keys = starting_between(hour.start_us, hour.end_us - 1)
         pages = archive.telemetry.pages(topic, keys)
         items: Iterator[Item] = (item for page in pages for item in page.items)
         expiries = [row.first_expires_s] if row is not None and row.first_expires_s else []
-        if row is not None and with_archived:
-            items = _with_archived(items, archive, row, files)
+        if with_archived:
+            items = _with_archived(items, archive, pending, row, files, unnamed=unnamed)
         written = write_hour(
             items,
             into,
@@ -115,22 +127,35 @@ def _write(
         )
         if row is None or with_archived or written.content == row.content:
             expiries += [written.first_expires_s] if written.first_expires_s else []
+            if unnamed and (row is None or written.content != row.content):
+                # The table may not have what that object has, as if it had expired there.
+                expiries.append(now_ms // 1000)
             return into, refused, written._replace(first_expires_s=min(expiries, default=0))
         # Something is new. Whether something is missing as well tells only the archive.
         with_archived = True
 
 
 def _with_archived(
-    stored: Iterator[Item], archive: Archive, row: ArchivedHour, files: ExitStack
+    stored: Iterator[Item],
+    archive: Archive,
+    pending: Pending,
+    row: ArchivedHour | None,
+    files: ExitStack,
+    *,
+    unnamed: str,
 ) -> Iterator[Item]:
     """The stored items of an hour, and those that only the archive has, in the order of their ids."""
-    hour = parse_hour(row.hour)
-    sources = [stored]
-    if row.key:
-        file = files.enter_context(archive.objects.read(row.key).file)
-        sources.append(archived_items(ArchiveFile(file), row.topic, hour))
-    if row.refused:
-        lines = files.enter_context(archive.objects.read(refused_key(parse_topic(row.topic), hour)).file)
+    topic, hour, sources = pending.topic, parse_hour(pending.period), [stored]
+    for key in filter(None, (row.key if row else "", unnamed)):
+        file = files.enter_context(archive.objects.read(key).file)
+        try:
+            sources.append(archived_items(ArchiveFile(file), topic, hour))
+        except (KeyError, OSError, TypeError, ValueError):
+            if key != unnamed:
+                raise
+            _log.warning("%s is no object of the archive, and no row names it: it is written anew", key)
+    if row is not None and row.refused:
+        lines = files.enter_context(archive.objects.read(refused_key(parse_topic(topic), hour)).file)
         sources.append(iter(sorted(map(json.loads, lines), key=key_of)))
     return merged(*sources)
 

@@ -6,9 +6,10 @@ import json
 import subprocess
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 
+import boto3
 import pytest
 from botocore.exceptions import ClientError
 
@@ -39,6 +40,7 @@ from iort_contract.archive import (
 )
 from iort_contract.tables import BATCH, EXPIRES_S, ROBOT, STREAMS, TOPIC
 from iort_contract.topics import RECORD, build_topic
+from iort_station.imports.stores import ArchiveStore
 from testkit.dynamodb import ARCHIVE as MANIFEST
 from testkit.dynamodb import FILES, ROBOTS, TELEMETRY, TOPIC_OF_CAR, item_of_message, record_of
 from tests.unit.functions.archiving import (
@@ -260,6 +262,111 @@ def test_of_two_runs_at_once_the_slower_one_changes_nothing(cloud, monkeypatch):
     # The queue delivers the task again.
     cloud.archived()
     assert cloud.speeds() == [1, 1, 1, 2, 2, 2]
+
+
+class Import:
+    """An import of a batch that the table does not have, with clients of its own. It is its cloud, too."""
+
+    namespace = "iort"
+
+    def __init__(self, cloud):
+        self.clients = {name: boto3.client(name) for name in ("dynamodb", "s3")}
+        self.item = cloud.store(30, [5, 5, 5], seq=1)
+        cloud.forget(self.item)
+
+    def client(self, service):
+        return self.clients[service]
+
+    def output(self, _noun, name):
+        return {"ArchiveTable": MANIFEST, "FilesBucket": FILES}[name]
+
+    def run(self):
+        store = ArchiveStore(self, CAR.robot)
+        store.items(CAR.name, [self.item])
+        store.flush(None)
+        store.close()
+
+
+def hold(monkeypatch, clients, call, act):
+    """Act once, before the client that has it makes its call; returns what is still to be done."""
+    client = next(one for one in clients if hasattr(one, call))
+    real, acts = getattr(client, call), [act]
+
+    def held(**request):
+        if acts:
+            acts.pop()()
+        return real(**request)
+
+    monkeypatch.setattr(client, call, held)
+    return acts
+
+
+def archived_in_the_end(cloud):
+    """The queue delivers again what failed."""
+    for _ in range(2):
+        with suppress(ClientError):
+            return cloud.archived(now_ms=LATER_MS)
+    raise AssertionError("the function failed twice")
+
+
+@pytest.mark.parametrize("before", ["nothing", "an hour", "a day"])
+@pytest.mark.parametrize(
+    ("first", "call"),
+    [
+        *[("function", call) for call in ("head_object", "get_item", "query", "put_object", "put_item")],
+        *[("import", call) for call in ("head_object", "get_item", "put_object", "update_item", "put_item")],
+        # Both have written the object, and then the import its row before the function.
+        ("import", "row"),
+    ],
+)
+def test_an_import_and_the_function_write_an_hour_at_once_and_nothing_is_lost(
+    cloud, monkeypatch, before, first, call
+):
+    """The first is held before a call, while the other one does its work."""
+    if before != "nothing":
+        for hour in (HOUR_0, HOUR_1):
+            cloud.store(0, [1, 1, 1], hour)
+            cloud.archived(hour, LATER_MS)
+    if before == "a day":
+        assert join_day(cloud) == {"joined": True}
+    imports = Import(cloud)
+    cloud.store(50, [9, 9, 9], seq=2)
+    functions = (cloud.archive.client, cloud.archive.objects._client)
+    left = []
+    if first == "function":
+        left.append(hold(monkeypatch, functions, call, imports.run))
+        archived_in_the_end(cloud)
+    elif call != "row":
+        left.append(hold(monkeypatch, imports.clients.values(), call, lambda: archived_in_the_end(cloud)))
+        imports.run()
+    else:
+        client = imports.client("dynamodb")
+        put_item = client.put_item
+
+        def both(**request):
+            monkeypatch.setattr(client, "put_item", put_item)
+            answers = []
+            left.append(hold(monkeypatch, functions, "put_item", lambda: answers.append(put_item(**request))))
+            archived_in_the_end(cloud)
+            return answers[0]
+
+        monkeypatch.setattr(client, "put_item", both)
+        imports.run()
+    assert left == [[]], "the call was never made"
+    kept = [] if before == "nothing" else [1, 1, 1]
+    for now_ms in (LATER_MS, LATER_MS + RETENTION_S * 1000):
+        assert cloud.speeds() == [*kept, 5, 5, 5, 9, 9, 9]
+        cloud.archived(now_ms=now_ms)
+    cloud.marks.add(DAY, 0)
+    join_day(cloud, now_ms=int(time.time() * 1000) + WRITING_MS + 1)
+    assert cloud.speeds() == [*kept, 5, 5, 5, 9, 9, 9]
+
+
+def test_an_object_that_is_no_archive_and_that_no_row_names_is_written_anew(cloud):
+    cloud.s3.put_object(Bucket=FILES, Key=hour_key(CAR, HOUR_0), Body=b"half an object")
+    cloud.store(0, [1, 1, 1])
+    cloud.archived()
+    assert cloud.speeds() == [1, 1, 1]
 
 
 def test_a_batch_that_comes_during_the_run_keeps_its_mark(cloud, monkeypatch):
