@@ -6,6 +6,7 @@ import json
 import math
 import re
 from functools import lru_cache
+from itertools import accumulate
 from operator import le
 from typing import Any, Mapping, Sequence
 
@@ -13,6 +14,7 @@ from iort_contract.limits import (
     MAX_BATCH_SPAN_US,
     MAX_FIELD_CHARACTERS,
     MAX_FIELDS,
+    MAX_NESTED,
     MAX_SAMPLES,
     SCHEMA_VERSION,
     ContractError,
@@ -185,15 +187,37 @@ def text(envelope: Mapping[str, Any], key: str) -> str:
     return value
 
 
+def json_text(text: Any, what: str) -> str:
+    """JSON as text, nested at most `MAX_NESTED` deep; what else is wrong with it, its parser says.
+
+    The parser must not find that by itself: Python before 3.10 ends its process if it collects garbage with a
+    finalizer where the stack is just full, and a stranger's JSON can fill the stack.
+    """
+    if isinstance(text, (bytes, bytearray)):
+        try:
+            text = text.decode(json.detect_encoding(text), "surrogatepass")
+        except ValueError as error:
+            raise ContractError(f"{what} is not JSON: {error}") from error
+    if not isinstance(text, str):
+        raise ContractError(f"{what} is not JSON: it must be a text, got {shown(text)}")
+    if text.count("[") + text.count("{") > MAX_NESTED:
+        brackets = _NO_BRACKETS.sub("", text)
+        if max(accumulate(map(_STEPS.__getitem__, brackets)), default=0) > MAX_NESTED:
+            raise ContractError(f"{what} is nested too deeply: at most {MAX_NESTED} levels are allowed")
+    return text
+
+
+# A text, also one without an end, or what is neither text nor bracket.
+_NO_BRACKETS = re.compile(r'"[^"\\]*(?:\\.?[^"\\]*)*(?:"|\Z)|[^"\[\]{}]+', re.DOTALL)
+_STEPS = {"[": 1, "{": 1, "]": -1, "}": -1}
+
+
 def json_object(text: Any, what: str) -> dict[str, Any]:
     """Parse a JSON object from text."""
+    text = json_text(text, what)
     try:
-        if isinstance(text, (bytes, bytearray)):
-            text = text.decode(json.detect_encoding(text), "surrogatepass")
         value = _DECODER.decode(text)
-    except RecursionError as error:
-        raise ContractError(f"{what} is nested too deeply") from error
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
         raise ContractError(f"{what} is not JSON: {error}") from error
     if not isinstance(value, dict):
         raise ContractError(f"{what} is not a JSON object")

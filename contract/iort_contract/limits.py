@@ -37,6 +37,8 @@ MAX_AHEAD_US = 366 * 86_400 * 1_000_000
 # A batch closes after a second, so a range query starts one second early and misses nothing.
 MAX_BATCH_SPAN_US = 1_000_000
 MAX_FIELDS = 512
+# Levels of JSON: far more than any ROS message has, far fewer than fill a stack.
+MAX_NESTED = 200
 # Samples times fields of a batch: a second of a car with 1000 Hz and 50 fields. The agent closes a batch at
 # 20,000 and splits a larger one. Decoding this many takes some 20 ms.
 MAX_BATCH_VALUES = 50_000

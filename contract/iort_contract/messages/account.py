@@ -10,7 +10,7 @@ import json
 from dataclasses import dataclass
 from typing import Mapping, NamedTuple, Union
 
-from iort_contract.checks import COMPACT
+from iort_contract.checks import COMPACT, json_text
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.envelope import read
 
@@ -93,9 +93,9 @@ def account(sample: Mapping[str, Value]) -> Account:
     """Decode an account; raises `ContractError` if it is neither kind."""
     if isinstance(sample.get("source"), str):
         try:
-            counts = json.loads(str(sample["counts"]))
+            counts = json.loads(json_text(str(sample["counts"]), "counts"))
             return SourceAccount(str(sample["source"]), {str(name): int(n) for name, n in counts.items()})
-        except (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ContractError(f"a source's account cannot be decoded: {error}") from error
     return read(StreamAccount, {name: value for name, value in sample.items() if value is not None})
 

@@ -15,7 +15,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import Any, Mapping, NamedTuple, Sequence
 
-from iort_contract.checks import COMPACT, shown, wire_column
+from iort_contract.checks import COMPACT, json_text, shown, wire_column
 from iort_contract.codec import packed, unpacked
 from iort_contract.limits import (
     MAX_BATCH_VALUES,
@@ -175,7 +175,7 @@ def from_columns(
     """
     n = len(times_us)
     try:
-        name, *head = json.loads(about)
+        name, *head = json.loads(json_text(about, "the part after the columns"))
         if not isinstance(name, str) or name not in layouts:
             raise ContractError(f"the messages' type {shown(name)} is unknown")
         decoder = decoder_of(layouts[name])

@@ -226,11 +226,25 @@ def read_yaml(file: Path) -> Any:
     except yaml.YAMLError as error:
         raise ConfigError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
     except RecursionError as error:
-        raise ConfigError(f"{file}: must be nested at most some hundred levels deep") from error
+        raise ConfigError(f"{file}: must be nested at most {_MOST_LEVELS} levels deep") from error
+
+
+_MOST_LEVELS = 50
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
     """Rejects a key given twice. YAML would silently keep the last one."""
+
+    _levels = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        # Before the stack is full: see `json_text`.
+        self._levels += 1
+        if self._levels > _MOST_LEVELS:
+            raise RecursionError
+        node = super().compose_node(parent, index)
+        self._levels -= 1
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:  # noqa: FBT001, FBT002 - as PyYAML has it
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]

@@ -19,7 +19,8 @@ from iort_agent.common.schema import Place, allowed, did_you_mean, items, text
 from iort_agent.errors import ConfigError, UplinkError
 from iort_agent.lanes import RuntimeSettings
 from iort_agent.mqtt.uplink import Link, MqttMessage
-from iort_contract.checks import check_field
+from iort_contract.checks import check_field, json_object
+from iort_contract.limits import ContractError
 from iort_contract.messages.commands import NO_MOTION, Command, DriveLimits
 from iort_contract.messages.recorder import Wanted
 from iort_contract.messages.shadow import (
@@ -338,13 +339,10 @@ def _log_error(error: UplinkError | None) -> None:
 
 def _read(message: MqttMessage) -> dict[str, Any] | None:
     try:
-        document = json.loads(message.payload)
-    except (ValueError, RecursionError):
-        document = None
-    if not isinstance(document, dict):
-        _log.warning("shadow %s: a message is not a JSON object", SHADOW)
+        return json_object(message.payload, "a message")
+    except ContractError as error:
+        _log.warning("shadow %s: %s", SHADOW, error)
         return None
-    return document
 
 
 def _version(document: Mapping[str, Any]) -> int:

@@ -23,6 +23,7 @@ from iort_agent.common.threads import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import LocalFile, Look, look_at, read, unreadable
 from iort_agent.files.upload import GaveWayError, Uploader
+from iort_contract.checks import json_text
 
 _log = logging.getLogger(__name__)
 
@@ -248,9 +249,9 @@ def _line(name: Path, done: _Done) -> bytes:
 def _saved(line: bytes) -> tuple[Path, _Done] | None:
     """What a line of the state says; None if it is damaged."""
     try:
-        name, size, mtime_ns, at_s = json.loads(line)
+        name, size, mtime_ns, at_s = json.loads(json_text(line, "a line"))
         return Path(name), _Done(Look(int(size), int(mtime_ns)), int(at_s))
-    except (ValueError, TypeError, ArithmeticError, RecursionError):
+    except (ValueError, TypeError, ArithmeticError):
         return None
 
 

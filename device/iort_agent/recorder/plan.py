@@ -22,6 +22,7 @@ from pathlib import Path, PurePath
 from typing import Any, Mapping
 
 from iort_agent.common.private_files import open_below, write_below
+from iort_contract.checks import json_text
 from iort_contract.limits import Value
 from iort_contract.messages import recorder
 from iort_contract.messages.recorder import KEPT, TAKE, UPLOADED
@@ -248,7 +249,7 @@ class Plan:
     def _load(self) -> None:
         try:
             with open_below(self.folder, PurePath(FILE)) as file:
-                content: Mapping[str, Any] = json.loads(file.read(_MAX_BYTES))
+                content: Mapping[str, Any] = json.loads(json_text(file.read(_MAX_BYTES), "it"))
             incidents = [
                 Incident(**{**one, "edges": [Edge(**edge) for edge in one["edges"]]})
                 for one in content["incidents"]
@@ -258,7 +259,7 @@ class Plan:
             self.cut = {key: (one[0], one[1], one[2]) for key, one in content.get("cut", {}).items()}
         except FileNotFoundError:
             return
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             self.alarm = f"recorder: {self.folder / FILE} cannot be read: pending incidents are lost: {error}"
             _log.error("%s", self.alarm)
             return

@@ -16,6 +16,7 @@ from typing import Any, Mapping
 
 from iort_agent.common.private_files import open_below, write_below
 from iort_agent.common.threads import Clock
+from iort_contract.checks import json_text
 
 _log = logging.getLogger(__name__)
 
@@ -107,7 +108,7 @@ class Repeats:
             return {}
         try:
             with open_below(self._file.parent, PurePath(self._file.name)) as file:
-                kept: Any = json.loads(file.read(_MAX_BYTES))
+                kept: Any = json.loads(json_text(file.read(_MAX_BYTES), "it"))
             same = kept.pop(_BOOT, {}).get(_BOOT) == self._boot
             return {
                 str(name): {str(key): str(digest) for key, digest in digests.items() if same or key.isdigit()}
@@ -115,6 +116,6 @@ class Repeats:
             }
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
+        except (OSError, ValueError, AttributeError, TypeError) as error:
             _log.warning("%s: cannot be read, so latched messages may be stored again: %s", self._file, error)
             return {}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from decimal import Decimal
 from typing import Any
@@ -13,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.catalog.analysis import KINDS, PARAMETERS
+from iort_contract.checks import json_object
 from iort_contract.findings_table import FindingsTable
-from iort_contract.limits import ContractError
+from iort_contract.limits import MAX_NESTED, ContractError
 from iort_contract.messages import analysis, commands, live, questions
 from iort_contract.messages.batch import decode_batch, encode_batch
 from tests.examples import examples
@@ -217,6 +220,67 @@ def test_a_message_with_one_key_removed_is_decoded_or_refused(good):
 def test_an_invalid_message_is_refused(decoder, message):
     with pytest.raises(ContractError):
         decoder(message)
+
+
+TEXTS = st.text('a"\\\\[]{},: \n', max_size=9)
+VALUES = st.recursive(TEXTS | st.integers(), lambda some: st.lists(some) | st.dictionaries(TEXTS, some))
+
+
+def depth(value: Any) -> int:
+    some = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    return 0 if some is None else 1 + max(map(depth, some), default=0)
+
+
+@given(st.lists(VALUES, max_size=3), st.integers(MAX_NESTED - 9, MAX_NESTED + 3), st.booleans())
+def test_json_is_refused_just_if_it_is_nested_too_deeply(
+    values: list[Any], levels: int, objects: bool
+) -> None:
+    value: Any = values
+    for level in range(levels):
+        value = {f"[{level}": value} if objects else [[], value]
+    message = {"a": value}
+    text = json.dumps(message)
+    if depth(message) <= MAX_NESTED:
+        assert json_object(text, "it") == json_object(text.encode("utf-16"), "it") == message
+    else:
+        with pytest.raises(ContractError, match="it is nested too deeply"):
+            json_object(text, "it")
+
+
+@pytest.mark.parametrize("end", ["", "\\", '"'])
+def test_texts_without_an_end_cost_no_more_than_their_length(end: str) -> None:
+    text = "[" * (MAX_NESTED + 1) + "]" * (MAX_NESTED + 1) + '"' + '\\"' * 400_000 + end
+    with pytest.raises(ContractError, match="nested too deeply"):
+        json_object(text, "it")
+
+
+DEEP_WHILE_GARBAGE_IS_COLLECTED = """
+import gc, sys
+from contextlib import suppress
+from iort_contract.checks import json_object
+from iort_contract.limits import ContractError
+class Garbage:
+    def __init__(self):
+        self.me = self
+    def __del__(self):
+        self.ended()
+    def ended(self):
+        pass
+limit = sys.getrecursionlimit()
+for allocations in range(limit - 60, limit + 60):
+    gc.set_threshold(allocations, 1, 1)
+    Garbage()
+    with suppress(ContractError):
+        json_object("[" * 100_000, "it")
+print("lives")
+"""
+
+
+def test_no_stack_is_full_when_garbage_is_collected() -> None:
+    """Python 3.8 ended the process: "Cannot recover from stack overflow"."""
+    command = [sys.executable, "-c", DEEP_WHILE_GARBAGE_IS_COLLECTED]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "lives\n"), done.stderr[:2000]
 
 
 def test_the_error_for_a_long_value_is_short():

@@ -21,6 +21,7 @@ from typing import Any, Mapping, NamedTuple, Protocol, Sequence
 from iort_agent.common.logs import ThrottledLog
 from iort_agent.common.threads import Clock
 from iort_agent.errors import SourceError
+from iort_contract.checks import json_text
 
 # A message so soon after a new subscription would have come without it, if the server had not been deaf.
 _AT_ONCE_S = 5.0
@@ -288,7 +289,8 @@ class RosbridgeConnection:
 
     def _take(self, data: bytes, arrival_us: int, now: float) -> None:
         try:
-            said = json.loads(data)
+            # rosbridge's JSON has NaN.
+            said = json.loads(json_text(data, "it"))
             operation = said["op"]
             if operation == "fragment":
                 whole = self._whole(said)
@@ -297,7 +299,7 @@ class RosbridgeConnection:
                 return
             if operation == "publish":
                 subscription, message = self._subscriptions.get(str(said["topic"])), said["msg"]
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             self._throttled.warn("malformed", f"{self._url}: a message is no rosbridge message: {error!r}")
             return
         if operation == "publish":
