@@ -118,12 +118,12 @@ def test_a_robot_cannot_be_added_twice(iort, tmp_path):
 def tab(embedded, tmp_path):
     """What bash offers after these words: `tab("query", "ca")`."""
 
-    def offered(*words):
+    def offered(*words, embedded_file=embedded.folder / EMBEDDED.name):
         asked = {
             "_IORT_COMPLETE": "complete_bash",
             "COMP_WORDS": " ".join(["iort", *words]),
             "COMP_CWORD": str(len(words)),
-            EMBEDDED_VARIABLE: str(embedded.folder / EMBEDDED.name),
+            EMBEDDED_VARIABLE: str(embedded_file),
             "XDG_CACHE_HOME": str(tmp_path / "cache"),
         }
         command = Path(sys.executable).parent / "iort"
