@@ -79,8 +79,17 @@ class AsyncInvocations:
     def __init__(self) -> None:
         self._pools: dict[str, Turns] = {}
 
-    def queue(self, account: str, region: str, function_arn: str, event: Any) -> None:
-        """Queue one event. Raises `LookupError` for an unknown function."""
+    def queue(
+        self,
+        account: str,
+        region: str,
+        function_arn: str,
+        event: Any,
+        *,
+        done: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Queue one event; ``done`` is called when it needs no more attempt. Raises `LookupError` for an
+        unknown function."""
         function, config, _ = lambda_svc._get_func_record_for_ref_in_scope(
             function_arn, account_id=account, region=region
         )
@@ -93,7 +102,13 @@ class AsyncInvocations:
             cores = os.cpu_count() or 1
             pool = Turns(cores if reserved is None else max(1, min(cores, reserved)))
             self._pools[function_arn] = pool
-        pool.submit(_robot(event), invoke, account, region, record, event, time.monotonic())
+        queued_s = time.monotonic()
+
+        def run() -> None:
+            invoke(account, region, record, event, queued_s)
+            done()
+
+        pool.submit(_robot(event), run)
 
 
 def _robot(event: Any) -> str:
