@@ -39,7 +39,8 @@ def open_page(browser):
         contexts.append(context)
         context.set_default_timeout(GUARD_S * 1000)
         page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
+        # A page that is left stops what its worker loads. One that cannot load it otherwise never connects.
+        page.on("pageerror", lambda error: "'importScripts'" in str(error) or errors.append(str(error)))
         page.on("console", lambda line: "Content Security Policy" in line.text and errors.append(line.text))
         page.goto(url)
         if listening:
