@@ -70,10 +70,10 @@ class Capture:
         self._thread.join(SILENT_S)
 
     def report(self) -> dict[str, Any]:
-        """The captured pictures, and the open camera's own counts."""
-        camera = self._camera
-        captured = self._number - self._first + 1
-        return {"captured": captured, "open": camera is not None, **(camera.report() if camera else {})}
+        """How many pictures are captured, the newest one's number, and the open camera's own counts."""
+        camera, number = self._camera, self._number
+        counts = {"captured": number - self._first + 1, "newest": number, "open": camera is not None}
+        return {**counts, **(camera.report() if camera else {})}
 
     def _run(self) -> None:
         while True:

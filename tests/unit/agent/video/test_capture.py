@@ -73,15 +73,15 @@ def rig() -> Iterator[Rig]:
 
 def test_nothing_is_captured_unless_somebody_looks(rig: Rig) -> None:
     rig.eye.shots.append(1.0)
-    assert rig.capture.report() == {"captured": 0, "open": False}
+    assert rig.capture.report() == {"captured": 0, "newest": 0, "open": False}
     assert rig.eye.opened == 0
     rig.capture.want(wanted=True)
     until(lambda: rig.taken)
-    assert rig.capture.report() == {"captured": 1, "open": True}
+    assert rig.capture.report() == {"captured": 1, "newest": 1, "open": True}
     rig.capture.want(wanted=False)
     until(lambda: rig.eye.closed == 1)
     rig.eye.shots.append(2.0)
-    assert rig.capture.report() == {"captured": 1, "open": False}
+    assert rig.capture.report() == {"captured": 1, "newest": 1, "open": False}
     rig.capture.want(wanted=True)
     until(lambda: len(rig.taken) == 2)
     assert rig.eye.numbers == [1, 2], "numbers count on"
@@ -107,7 +107,7 @@ def test_a_picture_of_the_former_run_is_never_fresh_in_this_one() -> None:
             rig.capture.want(wanted=True)
             frames = rig.shoot(*(10 + i / 10 for i in range(5)))
             assert [frame.number for frame in frames] == [first + i for i in range(5)]
-            assert rig.capture.report() == {"captured": 5, "open": True}
+            assert rig.capture.report() == {"captured": 5, "newest": first + 4, "open": True}
             ages += [rig.pictures.age_ms(number, 10.4) for number in (2, 4, 2**31, 2**31 + 3)]
         finally:
             rig.capture.close()
