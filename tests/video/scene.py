@@ -176,7 +176,7 @@ class Scene:
 
     def captured(self) -> int:
         """The number of the newest picture."""
-        return int((self.status().get("video") or {}).get("newest", 0))
+        return int((self.status().get("video") or {}).get("captured", 0))
 
     def strike(self, *words: object) -> None:
         """Kill a thread of the agent, or let it hang: see `tests.video.agent`."""
