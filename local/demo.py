@@ -325,7 +325,7 @@ class _Demo:
             sent = sum(report["streams"][name]["samples"] for name in streams)
         before, deadline = -1, 0.0
         while True:
-            found = [audit.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
+            found = [audit.delivery(embedded.cloud, ROBOT, stream, report["boot"]) for stream in streams]
             summarized = sum(one.samples_summarized for one in found)
             stored = sum(one.samples_stored for one in found)
             if summarized > before:

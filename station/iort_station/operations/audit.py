@@ -16,7 +16,7 @@ from iort_analysis.samples.batches import ATTRIBUTES, RefusedItems, part
 from iort_contract.archive import HASH
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.checks import shown
-from iort_contract.dynamodb import plain, starting_between
+from iort_contract.dynamodb import Keys, plain, seconds_between, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.account import StreamAccount
 from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
@@ -383,9 +383,15 @@ def items(cloud: Cloud, robot: str, stream: str) -> Iterator[dict[str, Any]]:
         yield from map(plain, found)
 
 
-def delivery(cloud: Cloud, robot: str, stream: str) -> Delivery:
-    """Count what the tables hold of a stream."""
-    stored = list(batches(cloud, robot, stream))
+def delivery(cloud: Cloud, robot: str, stream: str, run: str | None = None) -> Delivery:
+    """Count what the tables hold of a stream, of one ``run`` of the agent or of all."""
+    stored = [batch for batch in batches(cloud, robot, stream) if run in {None, batch.boot}]
+    seconds = None
+    if run is not None:
+        # Two runs of a robot are not in the same second.
+        first_us = min((batch.times_us[0] for batch in stored), default=0)
+        last_us = max((batch.times_us[-1] for batch in stored), default=0)
+        seconds = seconds_between(first_us // 1_000_000, last_us // 1_000_000)
     numbers: dict[str, set[int]] = {}
     for batch in stored:
         numbers.setdefault(batch.boot, set()).add(batch.seq)
@@ -393,11 +399,11 @@ def delivery(cloud: Cloud, robot: str, stream: str) -> Delivery:
         samples_stored=sum(len(batch.times_us) for batch in stored),
         batches_stored=len(stored),
         batches_missing=sum(max(seqs) - min(seqs) + 1 - len(seqs) for seqs in numbers.values()),
-        samples_summarized=samples_summarized(cloud, robot, stream),
+        samples_summarized=samples_summarized(cloud, robot, stream, seconds),
     )
 
 
-def samples_summarized(cloud: Cloud, robot: str, stream: str) -> int:
+def samples_summarized(cloud: Cloud, robot: str, stream: str, seconds: Keys | None = None) -> int:
     """The number of samples in the summary's seconds."""
-    pages = summary_table(cloud).pages(topic_of(cloud, robot, stream), attributes=(SAMPLES,))
+    pages = summary_table(cloud).pages(topic_of(cloud, robot, stream), seconds, attributes=(SAMPLES,))
     return sum(int(item[SAMPLES]["N"]) for page in pages for item in page.items)

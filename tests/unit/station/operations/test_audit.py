@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iort_contract.catalog.streams import AGENT_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, BatchId
+from iort_contract.tables import SAMPLES, SECOND, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from iort_station.operations.audit import audit, last_figures
-from testkit.dynamodb import TELEMETRY, item_of
+from iort_station.operations.audit import audit, delivery, last_figures
+from testkit.dynamodb import SUMMARY, TELEMETRY, item_of, serialize
 from tests.unit.station.data.test_queries import cloud_of
 
 T_US = 1_750_000_000_000_000
@@ -138,3 +140,21 @@ def test_the_agents_figures_come_from_its_newest_valid_batch():
     invalid = item_of(Batch("0badcafe", 1, [T_US + 1], {"backlog_batches": [4]}), topic)
     cloud.table.put(TELEMETRY, {**invalid, "codec": {"S": "none"}})
     assert last_figures(cloud, "car") == {}
+
+
+def test_what_another_run_has_stored_hides_no_loss_of_one():
+    """An import has come while the car drove."""
+    cloud = cloud_of(
+        Batch("0badcafe", 0, [T_US], {"speed": [1]}),
+        Batch("0badcafe", 1, [T_US + 1_500_000], {"speed": [2]}),
+        Batch("deadbeef", 0, [T_US - 60_000_000], {"speed": [3]}),
+    )
+    topic = build_topic(RECORD, "car", VESC_STREAM)
+    for second, samples in ((-60, 1), (0, 1), (1, 1), (90, 5)):
+        row = {TOPIC: topic, SECOND: T_US // 1_000_000 + second, SAMPLES: samples}
+        cloud.table.put(SUMMARY, {name: serialize(value) for name, value in row.items()})
+    of_one, of_all = delivery(cloud, "car", VESC_STREAM, "0badcafe"), delivery(cloud, "car", VESC_STREAM)
+    assert (of_one.samples_stored, of_one.samples_summarized) == (2, 2)
+    assert (of_all.samples_stored, of_all.samples_summarized) == (3, 8)
+    none = delivery(cloud, "car", VESC_STREAM, "feedbeef")
+    assert (none.samples_stored, none.samples_summarized) == (0, 0)
