@@ -45,7 +45,9 @@ def _data(environment: Mapping[str, str]) -> Path:
 def running(environment: Mapping[str, str] = os.environ) -> list[Path]:
     """The files of the embedded clouds that this user runs, wherever their folders are."""
     links = _links(environment)
-    return sorted(link.readlink() for link in links.iterdir() if link.exists()) if links.is_dir() else []
+    files = [link.readlink() for link in links.iterdir()] if links.is_dir() else []
+    # One that was killed has left its link and its file.
+    return sorted(file for file in files if file.exists() and owner(file.parent) is not None)
 
 
 @contextmanager

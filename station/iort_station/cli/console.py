@@ -109,6 +109,11 @@ def listing(
     return count
 
 
+def counted(count: int, what: str) -> str:
+    """A number of things: 1 drive, 2 drives."""
+    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
+
+
 def table(*head: str, left: Sequence[str] = (), title: str | None = None, wrap: bool = False) -> Table:
     """A table without lines, of numbers except in the columns ``left``; with ``wrap``, a cell may take
     several lines."""

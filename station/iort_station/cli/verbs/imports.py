@@ -14,7 +14,7 @@ from rich.filesize import decimal
 from rich.progress import DownloadColumn, MofNCompleteColumn, TransferSpeedColumn
 
 from iort_contract.tables import DEFAULT_RETENTION_DAYS
-from iort_station.cli.console import bar, errors, out, print_json, table
+from iort_station.cli.console import bar, counted, errors, out, print_json, table
 from iort_station.cli.options import AsJson, DryRun, Robot, argument, examples, option, resumable
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -110,7 +110,7 @@ def import_(
             outcomes: list[Outcome] = []
             going = [one for one in plans if one.goes_on]
             if not dry_run:
-                total = sum(sum(one.counts.values()) for one in plans if one.goes_on)
+                total = sum(sum(one.counts.values()) for one in going)
                 with bar("importing", total, MofNCompleteColumn()) as progress:
                     outcomes = run(
                         cloud,
@@ -164,8 +164,8 @@ def _show_plan(plan: Plan) -> None:
     where = "into the archive" if plan.store == "archive" else "into the table"
     state = f"{plan.there}: nothing to do" if plan.there else f"{'goes on ' if plan.begun else ''}{where}"
     out.print(
-        f"{plan.path.name}: {decimal(plan.size)}, {_times(plan)}, {sum(plan.counts.values()):,} messages of "
-        f"{len(plan.topics)} topics, {state}",
+        f"{plan.path.name}: {decimal(plan.size)}, {_times(plan)}, "
+        f"{counted(sum(plan.counts.values()), 'message')} of {counted(len(plan.topics), 'topic')}, {state}",
         soft_wrap=True,
     )
     for note in plan.notes:
@@ -185,10 +185,10 @@ def _times(plan: Plan) -> str:
 
 
 def _show_outcome(robot: str, outcome: Outcome) -> None:
-    files = f", {outcome.files:,} files" if outcome.files else ""
+    files = f", {counted(outcome.files, 'file')}" if outcome.files else ""
     out.print(
-        f"{outcome.plan.path.name}: imported {outcome.samples:,} samples of {len(outcome.counts)} streams"
-        f"{files}; the run {outcome.plan.run} of {robot}",
+        f"{outcome.plan.path.name}: imported {counted(outcome.samples, 'sample')} of "
+        f"{counted(len(outcome.counts), 'stream')}{files}; the run {outcome.plan.run} of {robot}",
         soft_wrap=True,
     )
     if outcome.end:

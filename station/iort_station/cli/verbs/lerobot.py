@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_type_hints
 
 from iort_contract.messages.recorder import UPLOADED
 from iort_station.cli import options
-from iort_station.cli.console import reading, tell
+from iort_station.cli.console import counted, reading, tell
 from iort_station.cli.options import Range, option, spread
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError, UsageError, unknown
@@ -104,25 +104,21 @@ def export(
             progress=progress,
         )
     counts = {**vars(written), "file": str(out), "fps": fps}
-    made = f"{_counted(written.episodes, 'episode')} of {_counted(written.frames, 'frame')}"
+    made = f"{counted(written.episodes, 'episode')} of {counted(written.frames, 'frame')}"
     tell(counts, f"{out}: {made}", as_json=as_json)
     options.say(f"state: {', '.join(map(str, state))}")
     options.say(f"action: {', '.join(map(str, action))}")
     if written.left_out:
         kind = (learning.episodes or "drives").removesuffix("s")
-        options.say(f"left out: {_counted(written.left_out, kind)}; the first: {written.reason}")
+        options.say(f"left out: {counted(written.left_out, kind)}; the first: {written.reason}")
     before = "the image before stands in place of each"
     if written.not_kept:
-        images = _counted(written.not_kept, "image")
+        images = counted(written.not_kept, "image")
         options.say(f"not kept by the robot: {images}; {before}. Incidents have every image")
     if written.damaged:
-        options.say(f"cannot be shown: {_counted(written.damaged, 'image')}; {before}")
+        options.say(f"cannot be shown: {counted(written.damaged, 'image')}; {before}")
     if written.resized:
-        options.say(f"resized to the first of their camera: {_counted(written.resized, 'image')}")
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
+        options.say(f"resized to the first of their camera: {counted(written.resized, 'image')}")
 
 
 def _unit(cloud: Cloud, robot: str, field: Field) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 from urllib.request import proxy_bypass
@@ -76,7 +77,11 @@ def test_outside_a_checkout_the_clouds_that_run_are_named(tmp_path, monkeypatch)
     running.parent.mkdir()
     Cloud(namespace="lab").save(running)
     advice = f"iort --embedded '{running}'"
-    with kept.announced(running):
+    with kept.announced(running), kept.lock_of(running.parent).open("w") as lock:
+        lock.write(str(os.getpid()))
+        lock.flush()
+        assert kept.running() == [], "it was killed: nobody has locked its folder"
+        fcntl.flock(lock, fcntl.LOCK_EX)
         assert advice in str(CliRunner().invoke(app, ["robots", "list"]).exception)
         with pytest.raises(StationError, match=re.escape(advice)):
             Cloud.find()
