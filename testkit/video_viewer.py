@@ -16,7 +16,7 @@ import secrets
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -52,8 +52,8 @@ from testkit.waiting import GUARD_S, InstrumentError, until
 
 # How long a picture with a hole may hold up those after it.
 _HOLE_S = 0.3
-# aiortc has no seam for it.
-_BUFFER = "_RTCRtpReceiver__jitter_buffer"
+# aiortc has no seam for them.
+_BUFFER, _QUEUE = "_RTCRtpReceiver__jitter_buffer", "_RTCRtpReceiver__decoder_queue"
 
 
 class Viewer:
@@ -127,7 +127,10 @@ class Viewer:
 class Prompt(JitterBuffer):
     """Gives a picture once its last packet has come, as browsers do, and begins again with a key picture
     after one that stays incomplete. aiortc's own waits for the first packet of the next picture, and for a
-    lost packet until 512 have come after it."""
+    lost packet until 512 have come after it.
+
+    aiortc takes one picture for each packet, so pictures that have waited behind a hole would stay late for
+    good: `behind` gives them."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__(capacity=512, is_video=True)
@@ -141,17 +144,28 @@ class Prompt(JitterBuffer):
             return True, frame
         return plead, frame
 
+    def behind(self) -> Iterator[JitterFrame]:
+        """The whole pictures that are next, after one that was given."""
+        while self._origin is not None and (frame := self._first()) is not None:
+            yield frame
+
     def _remove_frame(self, sequence_number: int) -> JitterFrame | None:  # noqa: ARG002 - as aiortc calls it
-        first, number = self._next(0)
+        first = self._first()
         if first is not None:
-            self.remove(number)
-            self._hole_since = None
             return first
         if any(self._packets):
             self._hole_since = self._hole_since or self._now()
             if self._now() - self._hole_since > _HOLE_S:
                 return self._skipped()
         return None
+
+    def _first(self) -> JitterFrame | None:
+        """Take the next picture, if it is whole."""
+        first, number = self._next(0)
+        if first is not None:
+            self.remove(number)
+            self._hole_since = None
+        return first
 
     def _at(self, place: int) -> Any:
         assert self._origin is not None, "set by the first packet"
@@ -187,6 +201,21 @@ class Prompt(JitterBuffer):
         return None
 
 
+class Decoded(queue.Queue[Any]):
+    """What the decoder of a receiver gets: with each picture those that wait `behind` it."""
+
+    def __init__(self, buffer: Prompt) -> None:
+        super().__init__()
+        self._buffer = buffer
+
+    def put(self, item: Any, block: bool = True, timeout: float | None = None) -> None:  # noqa: FBT001, FBT002 - as its base has it
+        super().put(item, block, timeout)
+        if item is not None:
+            # Their RTP timestamps stay as they came: nobody here reads them.
+            for frame in self._buffer.behind():
+                super().put((item[0], frame), block, timeout)
+
+
 def _is_key(data: bytes) -> bool:
     if data[:4] == b"\0\0\0\1":
         return data[4] & 0x1F in {5, 7}
@@ -208,7 +237,9 @@ class Watch:
         loop = asyncio.get_running_loop()
         transceiver = self.peer.addTransceiver("video", direction="recvonly")
         receiver = transceiver.receiver
-        setattr(receiver, _BUFFER, Prompt())
+        buffer = Prompt()
+        setattr(receiver, _BUFFER, buffer)
+        setattr(receiver, _QUEUE, Decoded(buffer))
         channel = self.peer.createDataChannel(CHANNEL, ordered=False, maxRetransmits=0)
         channel.on("message", self._mark)
         self.peer.on("connectionstatechange", lambda: self._tell({"state": self.peer.connectionState}))

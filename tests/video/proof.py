@@ -23,7 +23,7 @@ from iort_station.fleet.broker import Broker
 from iort_station.fleet.roles import Role
 from iort_station.operations import audit
 from local.figures import Spread
-from testkit.waiting import InstrumentError, reached, until
+from testkit.waiting import GUARD_S, InstrumentError, reached, until
 from tests.video.account import (
     Motion,
     Said,
@@ -160,10 +160,13 @@ class Proof:
                 self._pause.wait(CUT_S)
             end_us = _now_us()
             self._cut_ends.setdefault(name, []).append(end_us)
-            # What was captured before may still be shown, quickly.
-            newest = until(self.scene.captured, "the number of the newest picture")
-            reached(lambda: any((one.number or 0) > newest for one in shown()), within_s=60.0)  # noqa: B023 - within the loop
+            reached(lambda: self._again(shown(), end_us), within_s=GUARD_S, poll_s=1.0)  # noqa: B023 - within the loop
             self._pause.wait(_WARM_UP_S)
+
+    def _again(self, shown: Sequence[Shown], end_us: int) -> bool:
+        """Whether a live picture has come since, of those that are recorded by now."""
+        self._recorded()
+        return again_s(shown, self._captured, end_us, LIMIT_MS) is not None
 
     def _stretch(
         self,

@@ -174,10 +174,6 @@ class Scene:
         report = self.status().get("downlink") or {}
         return int((report.get("commands") or {}).get("drive", {}).get("passed", 0))
 
-    def captured(self) -> int:
-        """The number of the newest picture."""
-        return int((self.status().get("video") or {}).get("captured", 0))
-
     def strike(self, *words: object) -> None:
         """Kill a thread of the agent, or let it hang: see `tests.video.agent`."""
         before = len(self.agent.lines)

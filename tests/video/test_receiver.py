@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from aiortc.rtp import RtpPacket
 
-from testkit.video_viewer import Prompt
+from testkit.video_viewer import Decoded, Prompt
 
 KEY, OTHER = b"\x00", b"\x01"
 
@@ -69,3 +69,18 @@ def test_a_picture_that_comes_again_in_time_is_not_lost() -> None:
     frame = buffer.add(packet(2, 2, data=b"a"))[1]
     assert frame is not None
     assert frame.data == b"a" + OTHER
+
+
+def test_pictures_that_waited_behind_a_hole_are_decoded_at_once() -> None:
+    buffer = Prompt()
+    decoded = Decoded(buffer)
+    assert buffer.add(packet(1, 1, last=True))[1] is not None
+    for number in range(3, 10):
+        assert buffer.add(packet(number, number, last=True))[1] is None
+    decoded.put(("vp8", buffer.add(packet(2, 2, last=True))[1]))
+    given = [decoded.get_nowait() for _ in range(decoded.qsize())]
+    assert [(codec, frame.timestamp) for codec, frame in given] == [("vp8", n * 6000) for n in range(2, 10)]
+    # The next one waits for nothing.
+    assert buffer.add(packet(10, 10, last=True))[1] is not None
+    decoded.put(None)
+    assert decoded.get_nowait() is None
