@@ -48,7 +48,7 @@ from iort_agent.sources.registry import SourceRun
 from iort_agent.sources.ros import RosConfig
 from iort_agent.sources.sim import SimSource
 from iort_agent.spool import Spool
-from iort_agent.video import Pictures
+from iort_agent.video import Pictures, first_number
 from iort_agent.video.capture import make_camera
 from iort_agent.video.config import TopicCamera, VideoConfig
 from iort_agent.video.kept import keeper
@@ -273,6 +273,7 @@ class Agent:
             keep=keep,
             graph=graph,
             offset_us=self.offset.known_us,
+            first=first_number(self.boot),
         )
 
     def _in_ring(self, video: VideoConfig) -> bool:

@@ -100,8 +100,8 @@ class Show:
 
 
 class Mark(NamedTuple):
-    """A picture's number, from 1 in each run of the agent; its capture time by the robot's clock; and, in a
-    WebRTC session, its RTP timestamp."""
+    """A picture's number, which counts up in a run of the agent; its capture time by the robot's clock; and,
+    in a WebRTC session, its RTP timestamp."""
 
     number: int
     captured_us: int

@@ -24,7 +24,7 @@ KEPT_S = 10.0
 
 
 class Frame(NamedTuple):
-    """A captured picture. ``number`` counts from 1 in a run of the agent; ``captured_us`` is its capture time
+    """A captured picture. ``number`` counts in a run of the agent; ``captured_us`` is its capture time
     by the robot's clock, ``monotonic`` the same by the monotonic one, in seconds. ``picture`` is yuv420p of
     the configured size, and its ``pts`` counts at `RTP_HZ`. ``jpeg`` is what the camera gave, if it gives
     JPEGs, in its own size."""
@@ -68,6 +68,16 @@ class Pictures:
             if captured is not None:
                 return (now - captured) * 1000
             return math.inf if 1 <= number < next(iter(self._captured), 0) else None
+
+
+def first_number(run: str) -> int:
+    """The number of the first picture of a run of the agent: from 1 to 2 ** 31, by the run's name in hex.
+
+    A program that still names a picture of the former run must not name one that is fresh in this one. The
+    pictures of ten seconds of two runs have a number in common once in a million times. The other half of the
+    32 bits lasts for more than a year of pictures.
+    """
+    return 1 + (int(run[:8], 16) >> 1)
 
 
 def require(name: str) -> Any:

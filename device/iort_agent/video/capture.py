@@ -26,7 +26,8 @@ from iort_agent.video.sim_camera import HallCamera
 
 class Capture:
     """Takes a camera's pictures in a thread of its own while they are wanted. ``make`` gives the camera, and
-    ``take`` gets each picture, in that thread: it must not block. Safe to use from several threads."""
+    ``take`` gets each picture, in that thread: it must not block. ``first`` is the first picture's number.
+    Safe to use from several threads."""
 
     def __init__(
         self,
@@ -35,12 +36,13 @@ class Capture:
         *,
         take: Callable[[Frame], None],
         pictures: Pictures,
+        first: int = 1,
     ) -> None:
         self._make, self._clock, self._take, self._pictures = make, clock, take, pictures
         self._lock = threading.Lock()
         self._wanted, self._idle, self._ended = threading.Event(), threading.Event(), False
         self._camera: Camera | None = None
-        self._number, self._pts = 0, -1
+        self._first, self._number, self._pts = first, first - 1, -1
         self._thread = Supervised("camera", self._run)
 
     def start(self) -> None:
@@ -68,9 +70,9 @@ class Capture:
         self._thread.join(SILENT_S)
 
     def report(self) -> dict[str, Any]:
-        """The captured pictures, and the open camera's own counts."""
-        camera = self._camera
-        return {"captured": self._number, "open": camera is not None, **(camera.report() if camera else {})}
+        """How many pictures are captured, and the open camera's own counts."""
+        camera, captured = self._camera, self._number - self._first + 1
+        return {"captured": captured, "open": camera is not None, **(camera.report() if camera else {})}
 
     def _run(self) -> None:
         while True:

@@ -61,7 +61,8 @@ class Video:
 
     ``camera`` is asked when somebody looks for the first time, and gives what makes the camera whenever
     somebody begins to look. ``keep`` takes each picture for the recorder, if there is one. ``graph`` is the
-    camera's. ``offset_us`` converts the robot's times to the cloud's, if it is known.
+    camera's. ``offset_us`` converts the robot's times to the cloud's, if it is known. ``first`` is the number
+    of the first picture.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Video:
         keep: Callable[[Frame], object] | None = None,
         graph: Graph | None = None,
         offset_us: Callable[[], int | None] = lambda: None,
+        first: int = 1,
     ) -> None:
         self._config, self._link, self._clock = config, link, link.clock
         self.terms = config.terms()
@@ -114,7 +116,9 @@ class Video:
         self.published = self.held_back = 0
         self._encode_ms: deque[float] = deque(maxlen=_KEPT)
         self._sent_ms: deque[float] = deque(maxlen=_KEPT)
-        self._capture = Capture(self._make_watched, link.clock, take=self._on_frame, pictures=pictures)
+        self._capture = Capture(
+            self._make_watched, link.clock, take=self._on_frame, pictures=pictures, first=first
+        )
         self._thread = Supervised("video", self._run)
 
     def start(self) -> None:

@@ -2,7 +2,7 @@
 
 The stream `drive` has a sample of each command, with the number of the newest picture on the driver's screen
 and how old it was when the command came. The stream `video` has a sample of each picture that was shown, at
-its capture time. Numbers begin anew in every run of the agent, so both are joined by run and number."""
+its capture time. Every run of the agent has numbers of its own, so both are joined by run and number."""
 
 from __future__ import annotations
 

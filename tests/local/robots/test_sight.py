@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 
+from iort_agent.video import first_number
 from iort_contract.cloud import DRIVER
 from iort_contract.counter import read_counter
 from iort_contract.limits import LIVE_MAX_RATE_HZ
@@ -140,5 +141,6 @@ def test_what_a_driver_saw_is_told_of_each_command_and_kept_in_an_incident(embed
         with Image.open(file) as image:
             pixels = image.convert("L")
             assert read_counter(lambda x, y, of=pixels: of.getpixel((x, y)), *pixels.size) == int(file.stem)
+    assert all(one["frame"] >= first_number(one["run"]) for one in by_sight)
     named = {one["frame"] for one in by_sight}
     assert named <= {int(file.stem) for file in files}, "the ring had each picture that was driven by"

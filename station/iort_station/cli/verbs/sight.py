@@ -159,7 +159,7 @@ def _write(cloud: Cloud, robot: str, rows: Iterable[Seen], folder: Path, *, forc
     if folder.exists() and not folder.is_dir():
         raise StationError(f"{folder} must be a folder")
     folder.mkdir(parents=True, exist_ok=True)
-    # Numbers begin anew in each run.
+    # Two runs may have a number in common.
     several = len({run for run, _ in named.values()}) > 1
     written: dict[int, Path] = {}
     for one in incidents(cloud, robot, min(named), max(named) + 1) if named else ():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from fractions import Fraction
@@ -12,9 +13,10 @@ from av import VideoFrame
 
 from iort_agent.common.threads import WATCH, SystemClock
 from iort_agent.errors import VideoError
-from iort_agent.video import RTP_HZ, Frame, Pictures
+from iort_agent.video import RTP_HZ, Frame, Pictures, first_number
 from iort_agent.video.camera import Camera, Newest, Pacer
 from iort_agent.video.capture import Capture
+from iort_contract.counter import counter_bits
 from testkit.agent import ManualClock
 from testkit.waiting import until
 
@@ -45,11 +47,11 @@ class Eye(Camera):
 
 
 class Rig:
-    def __init__(self) -> None:
+    def __init__(self, **how: int) -> None:
         self.eye, self.pictures = Eye(), Pictures()
         self.taken: list[Frame] = []
         self.capture = Capture(
-            lambda: self.eye, SystemClock(), take=self.taken.append, pictures=self.pictures
+            lambda: self.eye, SystemClock(), take=self.taken.append, pictures=self.pictures, **how
         )
         self.capture.start()
 
@@ -93,6 +95,29 @@ def test_numbers_and_times_rise_whatever_the_stamps_say(rig: Rig) -> None:
     assert times == [900_000, 909_000, 909_001, 909_002, 918_000]
     assert {frame.picture.time_base for frame in frames} == {Fraction(1, RTP_HZ)}
     assert rig.pictures.age_ms(4, 10.2) == pytest.approx(1200)
+
+
+def test_a_picture_of_the_former_run_is_never_fresh_in_this_one() -> None:
+    """Also if each has captured only a few: a command may name the former one's for as long as it likes."""
+    ages: list[float | None] = []
+    for run in ("00000002d1d9b8f1", "fffffffe0c1b7a55"):
+        first = first_number(run)
+        rig = Rig(first=first)
+        try:
+            rig.capture.want(wanted=True)
+            frames = rig.shoot(*(10 + i / 10 for i in range(5)))
+            assert [frame.number for frame in frames] == [first + i for i in range(5)]
+            assert rig.capture.report() == {"captured": 5, "open": True}
+            ages += [rig.pictures.age_ms(number, 10.4) for number in (2, 4, 2**31, 2**31 + 3)]
+        finally:
+            rig.capture.close()
+    own, late = pytest.approx, math.inf
+    assert ages == [own(400), own(200), None, None, late, late, own(400), own(100)]
+
+
+def test_the_numbers_of_a_run_are_within_half_of_what_a_picture_shows() -> None:
+    assert [first_number(run) for run in ("0" * 16, "f" * 16)] == [1, 2**31]
+    counter_bits(2**31 + 365 * 86_400 * 60)
 
 
 def test_a_camera_that_fails_is_an_alarm_and_is_opened_again(rig: Rig) -> None:
