@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Iterator, Mapping
@@ -93,7 +94,12 @@ def middleware() -> str:
 
 def _others(shared_memory: Path = Path("/dev/shm")) -> bool:  # noqa: S108 - Linux' name for it
     """Whether another user's nodes have memory of Fast DDS."""
-    return any(file.stat().st_uid != os.getuid() for file in shared_memory.glob("fastrtps_port*"))
+    for file in shared_memory.glob("fastrtps_port*"):
+        # A node may end meanwhile.
+        with suppress(FileNotFoundError):
+            if file.stat().st_uid != os.getuid():
+                return True
+    return False
 
 
 class Ros2Source(RosSource):

@@ -49,18 +49,23 @@ def test_a_missing_rclpy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file away")
 def test_memory_of_another_user_is_found(tmp_path: Path) -> None:
     (tmp_path / "fastrtps_port7410").touch()
+    # A node ends while somebody looks.
+    (tmp_path / "fastrtps_port7411").symlink_to(tmp_path / "gone")
     assert not _others(tmp_path)
     os.chown(tmp_path / "fastrtps_port7410", 65534, 65534)
     assert _others(tmp_path)
 
 
-def test_nodes_of_another_user_are_warned_of(jazzy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.getuid", lambda: -1)
+@pytest.mark.parametrize("others", [True, False])
+def test_nodes_of_another_user_are_warned_of(
+    jazzy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, *, others: bool
+) -> None:
+    monkeypatch.setattr("iort_agent.sources.ros2._others", lambda: others)
     jazzy.middleware = "rmw_fastrtps_cpp"
     for name in TRANSPORTS:
         monkeypatch.delenv(name, raising=False)
     found = [finding.level for finding in Ros2Config(topics=()).check("source 0")]
-    assert found == ([OK, WARN] if any(Path("/dev/shm").glob("fastrtps_port*")) else [OK])
+    assert found == ([OK, WARN] if others else [OK])
     monkeypatch.setenv(TRANSPORTS[0], "UDPv4")
     assert len([*Ros2Config(topics=()).check("source 0")]) == 1
 
