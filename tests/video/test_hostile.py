@@ -13,6 +13,7 @@ from typing import Any
 import aiortc
 import pytest
 
+from iort_agent.errors import BusyError
 from iort_agent.status import SOCKET, fetch
 from iort_contract.messages.video import (
     ANSWER,
@@ -61,7 +62,12 @@ def viewer(embedded: EmbeddedCloud, car: Bundle) -> Iterator[Viewer]:  # noqa: F
 
 
 def told(car: Bundle) -> dict[str, Any]:
-    report: dict[str, Any] = fetch(car.folder / SOCKET)["video"]
+    def asked() -> dict[str, Any] | None:
+        with suppress(BusyError):
+            return fetch(car.folder / SOCKET)
+        return None
+
+    report: dict[str, Any] = until(asked, "the agent's status")["video"]
     return report
 
 
