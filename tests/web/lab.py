@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 import time
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.commands import NO_MOTION
 from iort_station.errors import StationError
 from iort_station.page import insights as analysis
+from testkit.waiting import GUARD_S
 from tests.unit.station.data.test_queries import START
 from tests.unit.station.data.test_runs import driven_cloud
 from tests.web.cars import GAIN, SAMPLE
@@ -199,6 +201,9 @@ class Lab:
     def __init__(self):
         self.asked = []
         self.refuses = False
+        # The counts of conditions wait for it.
+        self.counts = threading.Event()
+        self.counts.set()
         # Whether each car is told to stop, and whether it stands.
         self.cars = {"car-1": [False, False], "car-9": [False, False]}
         self.confirms = True
@@ -267,6 +272,7 @@ class Lab:
 
     def dry_run(self, asked):
         self.asked.append(dict(asked))
+        assert self.counts.wait(GUARD_S)
         if "sped" in asked["when"]:
             raise StationError("car-1 has no sped in vesc")
         return {"edges": 3, "told": 1, "samples": 3000, "times_s": []}

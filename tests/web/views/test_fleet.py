@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 from iort_agent.sources.sim.driver import HALL
@@ -70,8 +72,14 @@ def test_a_car_registered_after_the_page_opened_shows_metres_per_second(open_pag
     show(page, car.send())
     assert "15\u202f000" in speed.inner_text()
     vehicles["car-9"] = vehicles["car-2"] = {"speed_to_erpm_gain": GAIN}
-    Car(pubnub, "car-9").send()
-    until(lambda: "m/s" in speed.inner_text(), "metres a second")
+    new = (Car(pubnub, f"car-{number}") for number in itertools.count(9))
+
+    def learnt():
+        # A car that is new while a question is on its way asks none of its own.
+        next(new).send()
+        return "m/s" in speed.inner_text()
+
+    until(learnt, "metres a second")
     # The bar's ends are in metres a second, too.
     until(lambda: speed.locator(".gauge-scale").inner_text().split() == ["\u22123", "4"], "the new ends")
 

@@ -16,7 +16,7 @@ from iort_contract.topics import RECORD, build_topic
 from iort_station.page.answers import answers
 from iort_station.page.history import downloads
 from testkit.dynamodb import TELEMETRY, item_of
-from testkit.waiting import until
+from testkit.waiting import reached, until
 from tests.archived import FakeS3, archive, expire
 from tests.browser import plain
 from tests.unit.station.data.test_queries import START, cloud_of
@@ -252,7 +252,8 @@ def test_the_playback_is_as_fast_as_chosen(page):
         (began_s, first_s), *_, (ended_s, last_s) = [[0, 0], *steps, [0, 0]] if len(steps) < 2 else steps
         return (last_s - first_s) / (ended_s - began_s) if ended_s > began_s else 0
 
-    assert until(speed, "a playback in steps") == pytest.approx(16, rel=0.2)
+    # A busy machine draws a step late.
+    until(lambda: speed() == pytest.approx(16, rel=0.2), "a playback that is 16 times as fast")
     assert page.get_by_role("button", name="Play").is_visible()
 
 
@@ -337,8 +338,13 @@ def test_runs_are_compared_over_time_and_distance(page, server, past):
     page.locator("#compare-axis").select_option("distance")
     # From 1 m/s the second lap has 40 m. By v² = v0² + 2 a s:
     assert middle(page, 20, "m") == pytest.approx([2, math.sqrt(5)], abs=0.02)
-    drag(page, "Speed", 0.2, 0.3)
-    until(lambda: "zoom=" in page.url, "the zoom")
+
+    def zoomed():
+        # Seen once on a busy machine: nothing came of a drag.
+        drag(page, "Speed", 0.2, 0.3)
+        return reached(lambda: "zoom=" in page.url, within_s=30)
+
+    until(zoomed, "the zoom")
     page.reload()
     assert middle(page, 10, "m") == pytest.approx([math.sqrt(2), math.sqrt(3)], abs=0.02)
     page.locator("#compare-stream").select_option("agent")
@@ -407,6 +413,7 @@ def test_an_address_is_followed_although_the_view_before_writes_its_own(open_pag
 
 def test_the_range_that_is_shown_opens_in_foxglove(open_page, server):
     page = open_page(f"{server.url}#/history/car?{FIRST}", timezone_id="UTC")
+    loaded(page, "3000 samples")
     page.get_by_role("button", name="Open this range in Foxglove").click()
     dialog = page.get_by_role("dialog", name="Open in Foxglove")
     command = "iort bridge car --from 2023-11-14T22:13:20.000Z --to 2023-11-14T22:14:19.981Z"

@@ -420,14 +420,18 @@ def test_an_alarm_is_counted_before_it_is_set_and_shows_the_cars_answer(open_pag
     lab.keeps = {"accepted": False, "reason": "no recorder", "online": True}
     page = open_page(server.invitation(VIEWS["history"].address), timezone_id="UTC")
     chart = page.locator("section[aria-label='Battery voltage']")
+    lab.counts.clear()
     chart.get_by_label("Alarm", exact=True).click()
     form, add = chart.locator(".alarm-form"), chart.get_by_role("button", name="Add alarm")
     assert add.is_disabled()
+    lab.counts.set()
     until(add.is_enabled, "the count")
     assert "it would have come true 3 times, and told of it once (3000 samples)" in form.inner_text()
+    lab.counts.clear()
     form.get_by_label("Threshold").fill("11.5")
     assert add.is_disabled()
     form.get_by_label("for").fill("0.5")
+    lab.counts.set()
     until(lambda: form.locator("code").inner_text() == "voltage_input > 11.5 for 0.5s", "the condition")
     handle = chart.locator(".threshold")
     assert handle.get_attribute("aria-valuetext") == "11.50 V"

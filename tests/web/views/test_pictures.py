@@ -234,7 +234,7 @@ def test_a_card_outside_the_screen_has_a_name(page, car, url):
     page.goto(f"{url}#/")
     names = [f"car-{i}" for i in range(40)]
     for name in names:
-        show(page, Car(car.pubnub, name).send())
+        Car(car.pubnub, name).send()
     until(lambda: page.locator(".card").count() == len(names), "the cards")
     nodes = page.context.new_cdp_session(page).send("Accessibility.getFullAXTree")["nodes"]
     links = [node["name"]["value"] for node in nodes if node.get("role", {}).get("value") == "link"]

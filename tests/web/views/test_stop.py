@@ -92,12 +92,13 @@ def test_a_press_is_shown_at_once_and_what_to_do_without_an_answer(open_page, la
     for advice in ("Press again, and use the switch on the car.", "within 0.5 s of the last one"):
         assert advice in sent.inner_text()
     # The second press was within the second; a third is sent.
+    until(lambda: lab.pressed, "the first press to arrive")
     assert len(lab.pressed) == 1
     press.click()
     until(lambda: len(lab.pressed) == 2, "another stop")
     lab.stops.set()
     page.locator(".stop-words").filter(has_text="Emergency stop: car-1 stands.").wait_for()
-    assert not sent.is_visible()
+    sent.wait_for(state="hidden")
 
 
 def test_a_server_that_is_gone_has_stopped_nothing(open_page, server):
