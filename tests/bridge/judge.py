@@ -41,7 +41,11 @@ def bridging(
             yield json.loads(line)
         finally:
             process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=GUARD_S)
+            try:
+                _, errors = process.communicate(timeout=GUARD_S)
+            except subprocess.TimeoutExpired:
+                process.kill()  # or this would wait for it for ever
+                raise
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
 

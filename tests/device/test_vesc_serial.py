@@ -123,20 +123,21 @@ def test_an_unknown_length_is_logged_once_and_never_misread(
 
 def test_a_late_answer_is_not_used_for_the_next_request(vesc: VescStandin) -> None:
     """The second answer comes only after its timeout, before the next request."""
-    kept: list[bytes] = []
+    kept: list[tuple[bytes, int]] = []
 
     def answer(frame: bytes, n: int) -> list[bytes]:
         if n == 1:
-            kept.append(frame)
+            kept.append((frame, running.source.counts.timeouts))
             return []
         return [frame]
 
+    running = Running(config(vesc, rate_hz=0.5, timeout_s=0.3))
     vesc.answer = answer
-    with Running(config(vesc, rate_hz=0.5, timeout_s=0.3)) as running:
-        until(lambda: kept and running.source.counts.timeouts >= 1)
-        vesc.say(kept[0])
+    with running:
+        until(lambda: kept and running.source.counts.timeouts > kept[0][1])
+        vesc.say(kept[0][0])
         until(lambda: any(n > 1 for n in numbers(running)))
-        assert running.source.counts.late >= 1
+        until(lambda: running.source.counts.late >= 1)
     assert 1 not in numbers(running)
 
 

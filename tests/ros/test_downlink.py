@@ -11,6 +11,7 @@ import os
 import signal
 import time
 import xmlrpc.client
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,19 +97,31 @@ def guarded(graph: AnyGraph) -> tuple[Process, Process]:
     listener = graph.listener("driver", "/cmd_vel", TWIST[graph.ros])
     connected(downlink)
     if isinstance(graph, Graph):
-        with xmlrpc.client.ServerProxy(graph.environment["ROS_MASTER_URI"]) as master:
-            _, _, uri = master.lookupNode("/test", "/iort_agent_guard")
-        with xmlrpc.client.ServerProxy(uri) as guard:
-            until(lambda: any(one[4] == "/cmd_vel" for one in guard.getBusInfo("/test")[2]))
+        until(lambda: heard_by_guard(graph), "the guard's connection")
     else:
         listener.until(lambda: "publishers 2" in listener.lines, "connection to agent and guard")
     return downlink, listener
 
 
+def heard_by_guard(graph: Graph) -> bool:
+    # A guard that answered late was started again, at another address.
+    with suppress(OSError):
+        with xmlrpc.client.ServerProxy(graph.environment["ROS_MASTER_URI"]) as master:
+            _, _, uri = master.lookupNode("/test", "/iort_agent_guard")
+        with xmlrpc.client.ServerProxy(uri) as guard:
+            return any(one[4] == "/cmd_vel" for one in guard.getBusInfo("/test")[2])
+    return False
+
+
 def guard_of(downlink: Process) -> int:
-    """The process of its guard."""
-    (child,) = Path(f"/proc/{downlink.pid}/task/{downlink.pid}/children").read_text().split()
-    return int(child)
+    """The process of its guard; a thread starts it again if it answered late."""
+
+    def living() -> list[int]:
+        tasks = Path(f"/proc/{downlink.pid}/task").glob("*/children")
+        return [child for one in tasks for child in map(int, one.read_text().split()) if not ended(child)]
+
+    (child,) = until(lambda: found if len(found := living()) == 1 else None, "one guard")
+    return child
 
 
 def ended(pid: int) -> bool:

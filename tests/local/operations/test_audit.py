@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import SourceAccount, StreamAccount
 from iort_contract.messages.batch import Batch, batch_id, encode_batch
@@ -57,7 +59,14 @@ def test_the_audit_confirms_a_drive_and_finds_a_lost_batch_of_any_stream(embedde
     # `iort runs` and `iort streams` find the same run from a few batches.
     (run,) = json.loads(iort("runs", car.robot, "--json").stdout)["runs"]
     assert run["state"] == "ended"
-    assert 1.9 < run["seconds"] < 2.1
+    # A busy machine takes the first or the last ones late.
+    times_us = [
+        t_us
+        for stream in ("wheels", "pose")
+        for batch in audit.batches(embedded.cloud, car.robot, stream)
+        for t_us in batch.times_us
+    ]
+    assert run["seconds"] == pytest.approx((max(times_us) - min(times_us)) / 1e6, abs=0.001)
     assert run["streams"]["wheels"]["samples"] == 200
     listed = {
         one["stream"]: one for one in json.loads(iort("streams", car.robot, "--json").stdout)["streams"]

@@ -16,12 +16,13 @@ from iort_agent.errors import ConfigError, SourceError
 from iort_agent.ros import OnBytes
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.verbs.init import Seams, init
-from iort_agent.verbs.survey import Polls, ports
+from iort_agent.verbs.survey import Polls, Vesc, ports
 from iort_agent.video.config import TopicCamera
 from iort_contract.messages.commands import DOWNLINK_NOTE, VIDEO_NOTE, stick_downlink
 from iort_contract.ros.definition import Definition, parse
 from iort_contract.topics import stream_of
 from testkit.agent import ManualClock
+from testkit.waiting import until
 from tests.unit.agent.control.downlink_rig import HEADER
 from tests.vesc_standin import VescStandin
 
@@ -305,15 +306,29 @@ def test_a_node_that_must_leave_and_a_robot_without_anything_are_errors(tmp_path
     assert node.closed
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A VESC has answered before its time is over."""
+    end = Polls.end
+
+    def patiently(polls: Polls, least_s: float) -> Vesc:
+        until(lambda: polls._source.counts.samples > 1, "a VESC's answers")
+        return end(polls, least_s)
+
+    monkeypatch.setattr(Polls, "end", patiently)
+
+
 def test_a_vesc_is_found_by_its_answer(tmp_path: Path) -> None:
     with VescStandin(tmp_path / "vesc") as vesc:
         clock = SystemClock()
-        found = Polls(str(vesc.link), clock).end(1.0)
-        assert found.samples > 1
+        polls = Polls(str(vesc.link), clock)
+        until(lambda: polls._source.counts.samples > 1, "a VESC's answers")
+        assert polls.end(0.2).samples > 1
         vesc.answer = lambda _frame, _n: []
         assert Polls(str(vesc.link), clock).end(0.2).why == "no VESC answers there"
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_vesc_beside_a_graph_gets_a_stream_of_its_own(tmp_path: Path) -> None:
     clock = ManualClock()
     with VescStandin(tmp_path / "vesc") as vesc:

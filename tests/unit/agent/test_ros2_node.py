@@ -12,6 +12,7 @@ import pytest
 
 from iort_agent.common.threads import SystemClock
 from iort_agent.errors import SourceError
+from iort_agent.ros import ros2_node
 from iort_agent.ros.qos import DEPTH, DEPTH_OF_LARGE, Offer, QosConfig, request
 from iort_agent.ros.ros2_node import Node
 from iort_agent.ros.ros2_session import LOST
@@ -482,7 +483,8 @@ def test_a_service_that_cannot_be_offered_is_told(node: Node, caplog: pytest.Log
     soon(lambda: "the service /iort_agent/stop is not offered" in caplog.text)
 
 
-def test_the_last_user_closes_the_session(graph: FakeGraph) -> None:
+def test_the_last_user_closes_the_session(graph: FakeGraph, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros2_node, "_JOIN_S", GUARD_S)
     node = Node("iort_agent", graph.join, SystemClock(), FakeTypes(TEXTS))
     node.users = 2
     node.start()

@@ -33,6 +33,7 @@ from iort_agent.verbs.check import check, emergency_stop
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.messages.commands import stick_downlink
 from testkit.agent import Loopback, ManualClock, MemorySpool
+from testkit.waiting import GUARD_S
 from tests.unit.agent.test_agent import Rig, config_file, drive
 
 
@@ -44,6 +45,12 @@ def serving(path: Path, status: dict[str, Any]) -> Iterator[None]:
         yield
     finally:
         server.stop()
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine answers late."""
+    monkeypatch.setattr(status_module, "_TIMEOUT_S", GUARD_S)
 
 
 @pytest.fixture

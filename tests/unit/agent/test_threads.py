@@ -241,8 +241,9 @@ def ros2_node(kind: str, _folder: Path, _patch: pytest.MonkeyPatch) -> None:
     node._thread.join(SOON_S)
 
 
-def status(kind: str, folder: Path, _patch: pytest.MonkeyPatch) -> None:
+def status(kind: str, folder: Path, patch: pytest.MonkeyPatch) -> None:
     """It answers the next question."""
+    patch.setattr("iort_agent.status._TIMEOUT_S", SOON_S)
     server = StatusServer(folder / "agent.sock", lambda: {"alarms": alarms(kind) or surprise()})
     server.start()
     try:

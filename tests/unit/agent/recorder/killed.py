@@ -46,7 +46,8 @@ def main(folder: Path) -> None:
                 i += 1
 
     config = Config("car1", "host", Path(), Path(), (Script(play, "vesc", "chatter"),))
-    recorder = RecorderConfig(folder=folder / "ring", keep_free_mb=0)
+    # What a killed process wrote is in the kernel: a slow disk must not hold up the ring here.
+    recorder = RecorderConfig(folder=folder / "ring", keep_free_mb=0, sync_s=60.0)
     agent = Agent(
         replace(config, recorder=recorder),
         uplink=Loopback(clock, Dispatcher(), connected=False),

@@ -137,7 +137,7 @@ def test_the_time_may_be_that_of_the_middleware(graph: FakeGraph, start: Any) ->
     publisher.publish(floats(2), 5_000)
     source.until_samples(2)
     assert source.samples[0][1] == now_us - 5_000_000
-    assert abs(source.samples[1][1] - now_us) < 5_000_000
+    assert abs(source.samples[1][1] - now_us) < GUARD_S * 1_000_000
     assert source.report()["/t"]["unbelieved_stamps"] == 1
 
 
@@ -159,7 +159,7 @@ def test_a_remapped_topic_is_not_found_again_by_a_pattern(graph: FakeGraph, star
     graph.remapped["/t"] = "/robot/t"
     source = start("topics: {/t: {stream: s, time: arrival}, '/robot/*': {time: arrival}}")
     publisher = graph.publisher("/robot/t", FLOAT)
-    until(lambda: source.report().get("/t", {}).get("qos"))
+    until(lambda: graph.subscriptions)
     publisher.publish(floats(1))
     source.until_samples(1)
     assert [one[0] for one in source.samples] == ["s"]

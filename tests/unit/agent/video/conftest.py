@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from iort_agent.video import signalling
+from testkit.waiting import GUARD_S
 from tests.unit.agent.video.rig import Loop, Rig
 
 
@@ -15,8 +17,10 @@ def loop(socket_enabled):
 
 
 @pytest.fixture
-def make_rig(socket_enabled):
+def make_rig(socket_enabled, monkeypatch):
     """Makes robots with settings of car.yaml's section video."""
+    for name in ("GATHER_S", "CONNECT_S"):
+        monkeypatch.setattr(signalling, name, GUARD_S)
     rigs = []
 
     def make(**settings):

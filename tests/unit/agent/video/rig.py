@@ -81,6 +81,8 @@ class Counter:
         self._clock = clock
         self.opened = self.closed = 0
         self.error: Exception | None = None
+        # Raised by one read alone.
+        self.once: Exception | None = None
         # Cleared: the camera hangs.
         self.sees = threading.Event()
         self.sees.set()
@@ -98,6 +100,9 @@ class Counter:
                 return None
         if self.error is not None:
             raise self.error
+        once, self.once = self.once, None
+        if once is not None:
+            raise once
         return Frame(number, *instant(self._clock), drawn(number))
 
     def report(self) -> dict[str, Any]:

@@ -68,6 +68,7 @@ def rig() -> Iterator[Rig]:
     rig = Rig()
     yield rig
     rig.capture.close()
+    until(lambda: not rig.capture._thread.is_alive(), "the thread's end")
     assert rig.eye.opened == rig.eye.closed, "nothing stays open"
 
 
@@ -138,7 +139,7 @@ def test_after_the_end_nobody_can_look() -> None:
     rig.capture.close()
     rig.capture.want(wanted=True)
     rig.eye.shots.append(1.0)
-    assert not rig.capture._thread.is_alive()
+    until(lambda: not rig.capture._thread.is_alive(), "the thread's end")
     assert rig.eye.opened == 0
 
 

@@ -151,12 +151,18 @@ def test_a_seek_drops_what_was_about_to_be_sent() -> None:
 
 
 def test_another_subscription_goes_on_where_the_playhead_is_and_repeats_nothing() -> None:
-    audience = Audience(0)
-    with Player(Ticks(600, topics=2), audience) as player:
+    audience, another = Audience(0), threading.Event()
+
+    def hold(i: int) -> None:
+        if i == 200:
+            another.wait()
+
+    with Player(Ticks(600, topics=2, hold=hold), audience) as player:
         control(player, Request(play=True))
         until(lambda: len(audience.got) > 100)
         audience.topics = frozenset({0, 1})
         player.rewanted(1)
+        another.set()
         until(audience.ended)
     times = {topic: [one.t_ns // SECOND for one in audience.got if one.topic == topic] for topic in (0, 1)}
     assert times[0] == list(range(600))

@@ -18,12 +18,13 @@ from iort_agent.control.shadow import _merged
 from iort_contract.messages.commands import NO_MOTION, DriveLimits, encode_limits
 from iort_contract.messages.shadow import Pressed, encode_stop
 from iort_contract.messages.video import VideoTerms, encode_terms
-from iort_station.cli.verbs.control import commands
+from iort_station.cli.verbs import control as verb
 from iort_station.cli.verbs.robots import commands as robots
 from iort_station.errors import StationError, UsageError
 from iort_station.fleet.seat import driver_of
 from iort_station.operations.alarms import user
 from iort_station.page import answers, motion
+from testkit.agent import ManualClock
 from testkit.waiting import GUARD_S
 
 # A page that shows every stop.
@@ -291,7 +292,7 @@ def iort_stop(cloud: Shadows, *arguments: str) -> Any:
             raise StationError("the embedded cloud does not answer")
         return cloud
 
-    return CliRunner().invoke(commands, ["stop", *arguments], obj=SimpleNamespace(cloud=found))
+    return CliRunner().invoke(verb.commands, ["stop", *arguments], obj=SimpleNamespace(cloud=found))
 
 
 class Robots(Shadows):
@@ -334,7 +335,9 @@ def test_a_named_robot_is_stopped_and_its_answer_told_while_the_registry_is_sile
         cloud.registry.set()
 
 
-def test_a_robot_that_does_not_answer_is_told_after_a_second_with_what_else_stops_it(cloud):
+def test_a_robot_that_does_not_answer_is_told_after_a_second_with_what_else_stops_it(cloud, monkeypatch):
+    clock = ManualClock()
+    monkeypatch.setattr(verb, "time", SimpleNamespace(monotonic=clock.monotonic, sleep=clock.advance))
     done = iort_stop(cloud, "car7", "--seconds", "1.2")
     assert "no answer after 1 s from car7" in done.stderr
     assert "use the switch at the car" in done.stderr
@@ -350,7 +353,8 @@ def test_a_robot_that_is_away_is_not_waited_for_nor_said_to_stand(cloud):
     assert done.exit_code == 0
 
 
-def test_a_stranger_is_no_stopped_robot_and_said_before_anything_else(cloud):
+def test_a_stranger_is_no_stopped_robot_and_said_before_anything_else(cloud, monkeypatch):
+    monkeypatch.setattr(verb, "_LOOK_S", GUARD_S)
     done = iort_stop(cloud, "car9", "--seconds", str(GUARD_S))
     assert done.stderr.startswith("iort: robot car9 is not registered; the nearest: car")
     assert "sent to" not in done.stderr
