@@ -62,6 +62,9 @@ def test_a_program_keeps_by_service_and_topic_and_the_map_is_there(
     assert plan.save()
     first = started(graph, tmp_path)
     until(lambda: [*(ring / "latched").glob("*.mcap")], within_s=WAIT_S)
+    # And that it came is known to the next run.
+    known = tmp_path / "queue.db.latched"
+    until(lambda: known.exists() and "/map" in known.read_text(), within_s=WAIT_S)
     first.process.kill()
     agent = started(graph, tmp_path)
     caller = graph.run("caller.py", "planner", "keep", "--alone")
@@ -73,7 +76,7 @@ def test_a_program_keeps_by_service_and_topic_and_the_map_is_there(
     def again() -> bool:
         # The cooldown is a second at least.
         caller.say("near miss")
-        return bool(agent.status()["recorder"].get("merged"))
+        return bool(agent.told()["recorder"].get("merged"))
 
     until(again, within_s=WAIT_S)
     (path,) = until(lambda: [*(ring / "incidents").glob("*.mcap")], within_s=WAIT_S)

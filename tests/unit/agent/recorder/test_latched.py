@@ -211,7 +211,24 @@ def test_it_outlives_the_process_and_comes_again_without_being_new(tmp_path: Pat
     again.ring.close()
 
 
-def repeat(desk: Desk, n: int, publisher: str = "/a") -> None:
+def test_a_publisher_of_ros_2_that_has_another_name_in_the_next_run_is_the_same(tmp_path: Path) -> None:
+    """Its messages are found before its node is."""
+    desk = Desk(tmp_path / "ring")
+    old = latch(desk, 1, "/a", STATIC)
+    desk.pass_s(2)
+    desk.kill()
+    again = Desk(tmp_path / "ring", desk.clock, run="b")
+    for _ in range(2):
+        repeat(again, 1, "_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_", STATIC)
+    begin_us = again.ring.now_us()
+    again.imu(0, 1)
+    again.pass_s(1)
+    file = cut_of(again, begin_us, again.ring.now_us())
+    assert [(own_us, data) for _, own_us, data in file.messages["/tf_static"]] == [(T0, old)]
+    again.ring.close()
+
+
+def repeat(desk: Desk, n: int, publisher: str = "/a", kind: RosType = MAP) -> None:
     """A message that came before comes again, by an intake that remembers it."""
 
     def emit(stream: str, t_us: int, values: Mapping[str, Any], *, more: bool = False) -> float:
@@ -219,16 +236,17 @@ def repeat(desk: Desk, n: int, publisher: str = "/a") -> None:
         return desk.emit(stream, 5, values, more=more)
 
     intake = Intake(
-        "/map",
-        TopicConfig(time="arrival", stream="map"),
+        kind.topic,
+        TopicConfig(time="arrival", stream=kind.topic.strip("/")),
         emit=emit,
         clock=desk.clock,
         whole=True,
     )
-    header = {"type": MAP.name, "md5sum": MAP.md5sum, "message_definition": DEFINITION}
+    header = {"type": kind.name, "md5sum": kind.md5sum, "message_definition": DEFINITION}
     header.update(latching="1", callerid=publisher)
-    intake._latched.came_before(publisher, body(n))
-    intake.take(header, body(n))
+    ros2 = "/msg/" in kind.name
+    intake._latched.came_before("5" if ros2 else publisher, body(n))
+    intake.take(header, body(n), source_ns=5 if ros2 else 0)
     desk.passed = [one for one in desk.passed if one[0] != TYPES_STREAM]
 
 
