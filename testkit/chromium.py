@@ -61,7 +61,7 @@ def opened() -> Iterator[Browser]:
             browser.close()
 
 
-_START_S = 30.0
+_START_S = 120.0
 
 
 class Tabs:

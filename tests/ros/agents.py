@@ -9,6 +9,7 @@ import yaml
 
 from iort_agent.errors import AgentError
 from iort_agent.status import fetch
+from testkit.waiting import until
 from tests.local.faults.test_uplink import self_signed
 from tests.ros.process import Process
 from tests.unit.agent.test_agent import config_file
@@ -29,7 +30,11 @@ class Agent(NamedTuple):
         try:
             return fetch(self.folder / "agent.sock")
         except AgentError:
-            return {}  # no status yet
+            return {}  # none yet, or too busy
+
+    def told(self) -> dict[str, Any]:
+        """Wait for the status."""
+        return until(self.status, "the agent's status")
 
     def waits(self) -> list[str] | None:
         """Return the alarms of waiting sources; None without a status."""

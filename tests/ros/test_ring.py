@@ -33,7 +33,7 @@ def killed(agent: Agent, topics: int) -> dict[str, list[tuple[Any, Any, int, byt
         return int(((agent.status().get("recorder") or {}).get("ring") or {}).get("written", 0))
 
     until(lambda: written() >= topics * LEAST, within_s=WAIT_S)
-    status = agent.status()
+    status = agent.told()
     assert "alone" not in status["streams"], "it is neither recorded nor live"
     agent.process.kill()
     heard: dict[str, list[tuple[Any, Any, int, bytes]]] = {}

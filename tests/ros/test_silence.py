@@ -48,10 +48,10 @@ def test_a_silent_topic_is_stale_and_its_latched_message_stays_old(
     car.process.until_said("does not answer")
     graph.start_master()
     car.process.until_said("registered again")
-    assert samples() == (20, 1)
-    stale = car.status()["streams"]
+    until(lambda: samples() == (20, 1), within_s=WAIT_S)
+    stale = car.told()["streams"]
     assert all(stale[name]["silent_s"] >= 5 and stale[name]["per_s"] == 0 for name in ("wheel", "plan"))
-    assert all(car.topic(name)["silent"] for name in ("/wheel", "/plan"))
+    assert all(car.told()["sources"][0][name]["silent"] for name in ("/wheel", "/plan"))
 
     plan.kill()
     publisher(graph, "plan", *latched, "--start", 7)

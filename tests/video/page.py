@@ -132,7 +132,7 @@ class Viewer:
 
     def connect(self) -> None:
         """Have the browser in hand, again, with the car's page if it is open."""
-        self._browser = self._play.chromium.connect_over_cdp(self.tabs.url)
+        self._browser = self._play.chromium.connect_over_cdp(self.tabs.url, timeout=_START_MS)
         self._browser.contexts[0].set_default_timeout(_START_MS)
         found = [page for page in self._browser.contexts[0].pages if self._scene.robot in page.url]
         if found:

@@ -91,7 +91,7 @@ class Drive:
     def _killed(self) -> None:
         robot, at_s = self.robot, self._fire()
         self._pause.wait(1)
-        self.written = robot.status()["recorder"]["ring"]["written"]
+        self.written = robot.told()["recorder"]["ring"]["written"]
         self._killed_us = time.time_ns() // 1000
         robot.agent.kill()
         self.recovered = recovered(robot.ring)
@@ -144,7 +144,7 @@ class Drive:
         self._collect("publisher and master restart", at_s)
 
     def _burst(self) -> None:
-        robot, before = self.robot, self.robot.status()["recorder"]
+        robot, before = self.robot, self.robot.told()["recorder"]
         often = _trigger("often", OFTEN)
         robot.trigger(
             replace(often, before_s=0.2, after_s=0.3, cooldown_s=COOLDOWN_S, budget_mb_day=BUDGET_MB)
@@ -154,7 +154,7 @@ class Drive:
             robot.demand(OFTEN)
             self._pause.wait(EVERY_S)
         until(lambda: not robot.recorder("open") and not robot.recorder("waiting"))
-        after = robot.status()["recorder"]
+        after = robot.told()["recorder"]
         self.edges, self.cooled = (after.get(name, 0) - before.get(name, 0) for name in ("edges", "cooled"))
 
         def told() -> list[Incident]:

@@ -142,6 +142,10 @@ class Robot:
         """What the agent tells of itself; nothing while it starts."""
         return self.agent.status(self.bundle.folder / SOCKET)
 
+    def told(self) -> dict[str, Any]:
+        """Wait for the status."""
+        return until(self.status, "the agent's status")
+
     def _ring_stopped(self) -> bool | None:
         """Whether the ring says that it has no room; None without a status."""
         alarms = self.status().get("alarms")

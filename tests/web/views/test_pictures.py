@@ -242,7 +242,8 @@ def test_a_card_outside_the_screen_has_a_name(page, car, url):
     assert "" not in links
 
 
-def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(page, car):
+def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(open_page, url, car):
+    page = open_page(f"{url}#/car/car-1?window=300")
     for volts in (11.0, 12.5, 11.75):
         show(page, car.send({**SAMPLE, "voltage_input": volts}))
     chart = page.locator("[role=img][aria-label^='Chart Battery voltage']")
@@ -264,7 +265,7 @@ def test_a_chart_is_told_in_words_and_has_a_cursor_for_arrow_keys(page, car):
     # The keys moved the cursor, and not to another car.
     page.keyboard.press("Escape")
     until(lambda: spoken.inner_text() == "", "the cursor to be gone")
-    assert page.url.endswith("#/car/car-1")
+    assert page.url.endswith("#/car/car-1?window=300")
 
 
 def test_a_chart_of_the_past_is_told_in_words_and_has_a_cursor_for_arrow_keys(open_page, server):
