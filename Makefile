@@ -43,8 +43,8 @@ test: setup ## run every test but the heaviest: REQUIRE_ALL=1 makes a skip a fai
 test-heavy: setup ## run the scenarios that take minutes: options as for test
 	@$(PYTEST) -m heavy
 
-test-all: setup ## run every test, as CI does: options as for test
-	@$(PYTEST)
+test-all: setup ## run every test, as CI does: options as for test, AGAIN=1 runs up to 3 that failed once more, alone
+	@$(if $(AGAIN),$(BIN)/python scripts/again.py) $(PYTEST)
 
 test-fast: setup ## run the unit tests that need no emulator, browser or ROS: while you work, WORKERS=2
 	@$(BIN)/python -m pytest tests/unit --numprocesses $(or $(WORKERS),2) --dist loadscope --no-loadscope-reorder \

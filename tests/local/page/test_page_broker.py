@@ -48,7 +48,7 @@ def served(cloud):
 def test_the_page_wakes_a_car_over_its_own_connection_and_lets_it_sleep(embedded, bundle, open_page):
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}
     car = bundle(sources=[source], live={"when": "watched"})
-    count = f"iort.robots['{car.robot}']?.streams.{VESC_STREAM}.received ?? 0"
+    count = f"iort.robots['{car.robot}']?.streams.{VESC_STREAM}?.received ?? 0"
     with served(embedded.cloud) as server, AgentProcess(car, drain_s=0):
         page = open_page(f"{server.url}#/alarms")
         until(lambda: page.evaluate(count), "the first message, which a car sends of itself")

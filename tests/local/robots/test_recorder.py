@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from iort_contract.messages.recorder import UPLOADED
+from iort_contract.messages.recorder import ABOUT_RECORD, UPLOADED
 from iort_contract.tables import ONLINE
 from iort_station.bridge.stored import McapFile
 from iort_station.cli.verbs.incidents import downloaded
@@ -65,9 +65,17 @@ def test_a_trigger_and_a_take_end_in_files_that_anybody_can_open(iort, bundle, e
     for path in map(Path, got.stdout.split()):
         (one,) = [one for one in listed if one["id"] in path.name]
         with path.open("rb") as file:
-            times = [message.publish_time // 1000 for _, _, message in make_reader(file).iter_messages()]
+            reader = make_reader(file)
+            (about,) = [record.metadata for record in reader.iter_metadata() if record.name == ABOUT_RECORD]
+            messages = [message for _, _, message in reader.iter_messages()]
+        times = [message.publish_time // 1000 for message in messages]
         assert len(times) == one["messages"]
-        assert one["from_us"] <= min(times) < max(times) <= one["to_us"]
+        # A message that came in the window was published some microseconds before.
+        ring_from_us, ring_to_us = int(about["ring_from_us"]), int(about["ring_to_us"])
+        assert all(
+            ring_from_us <= message.log_time // 1000 <= ring_to_us or one["from_us"] <= t_us <= one["to_us"]
+            for message, t_us in zip(messages, times, strict=True)
+        )
         stored = (t_us for batch in audit.batches(embedded.cloud, robot, "vesc") for t_us in batch.times_us)
         assert len(times) >= sum(one["from_us"] <= t_us <= one["to_us"] for t_us in stored) > 0, one
         played = McapFile(downloaded(embedded.cloud, one["id"], tmp_path / one["id"]))
