@@ -4,6 +4,7 @@ functions."""
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import threading
@@ -159,6 +160,8 @@ class Killer(threading.Thread):
                 # Its imports take half a second of the processor.
                 if self.left and used_s - self._before.get(process, 0.0) > 1.1:
                     os.kill(process, signal.SIGKILL)
+                    # It is seen until it has had the processor once more to die.
+                    self._before[process] = math.inf
                     self.left -= 1
 
     def __enter__(self) -> Self:
