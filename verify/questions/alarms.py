@@ -14,6 +14,7 @@ from iort_contract.catalog.vesc import FAULT_FIELD
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.messages.page import AlarmEntry
 from iort_contract.topics import LIVE
+from iort_station.errors import StationError
 from iort_station.operations import alarms
 from testkit.target import configure
 from testkit.waiting import InstrumentError, until
@@ -99,12 +100,22 @@ def acknowledged(lab: Lab) -> Seen:
     def entry() -> AlarmEntry:
         return next(one for one in alarms.alarms(lab.cloud) if one["name"] == alarm["AlarmName"])
 
-    _raise(lab, alarm)
-    raised = entry()
-    seen = alarms.acknowledge(lab.cloud, raised["key"], raised["since_s"], _BY)
-    kept = entry()["acknowledged"]
-    same = kept is not None and abs(kept["at_s"] - seen["at_s"]) < 0.01
-    return {"by": kept["by"] if kept else None, "kept": same}
+    def kept() -> Seen | None:
+        """None if the alarm's own evaluation, which may come at any moment, has ended it."""
+        _raise(lab, alarm)
+        raised = entry()
+        try:
+            seen = alarms.acknowledge(lab.cloud, raised["key"], raised["since_s"], _BY)
+        except StationError:
+            return None
+        after = entry()
+        if (after["state"], after["since_s"]) != (_ALARM, raised["since_s"]):
+            return None
+        told = after["acknowledged"]
+        same = told is not None and abs(told["at_s"] - seen["at_s"]) < 0.01
+        return {"by": told["by"] if told else None, "kept": same}
+
+    return until(kept, "an alarm that stays raised while it is acknowledged")
 
 
 set_state_with_key = replace(
