@@ -3,6 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 # The environment's bytecode is its own. Without it each of a hundred processes compiles every module again.
 export PYTHONDONTWRITEBYTECODE :=
+# The CDK's library runs on the environment's Node: the machine may have none, or an old one.
+export JSII_NODE := $(CURDIR)/$(BIN)/node
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 from collections import Counter
 from collections.abc import Generator, Iterator
 from functools import lru_cache
@@ -91,6 +92,8 @@ def pytest_configure() -> None:
     """Let tests import the ministack of the embedded cloud: the installed one with local/patches/."""
     # The CDK's own validation only warns, and is most of a synthesis. `make check` has it.
     os.environ["CDK_VALIDATION"] = "false"
+    # The environment's Node: the machine may have none.
+    os.environ["JSII_NODE"] = str(Path(sys.executable).with_name("node"))
     # Threads of PubNub's SDK outlive their client, and would log into later tests.
     logging.getLogger("pubnub").propagate = False
     if find_spec("ministack"):

@@ -20,9 +20,10 @@ from tests.stacks.test_monitoring import FUNCTIONS
 
 
 def run(tmp_path, name, **context):
-    """Start app.py in an environment without this machine's AWS settings."""
+    """Start app.py in an environment without this machine's AWS settings and commands, Node among them."""
     env = {
-        "PATH": os.environ["PATH"],
+        "PATH": "",
+        "JSII_NODE": os.environ["JSII_NODE"],
         "HOME": str(tmp_path),
         # The cache of `make deploy`; otherwise every run would unpack the CDK again.
         "JSII_RUNTIME_PACKAGE_CACHE_ROOT": str(ROOT / "build" / "jsii-cache"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -42,3 +43,9 @@ def test_a_step_that_failed_half_way_runs_again_with_the_input_of_its_last_succe
     # As after `git switch` to another branch and back.
     (checkout / "input").write_text("good")
     assert _ran(checkout)
+
+
+def test_every_command_runs_the_cdk_on_the_environments_node() -> None:
+    command = ["make", "--silent", "--eval", "node: ; @echo $$JSII_NODE", "node"]
+    done = subprocess.run(command, cwd=setup.ROOT, text=True, capture_output=True, check=True)
+    assert done.stdout.strip() == str(setup.ROOT / ".venv" / "bin" / "node")
