@@ -63,7 +63,7 @@ mutants: setup ## count how many of 300 fixed small faults the fast unit tests n
 check: setup ## run the linters, the type checkers, the links of docs/ and its generated parts, and cfn-lint, cdk-nag and checkov over the stacks
 	@$(PYTHON) scripts/setup.py --checkov
 	@$(BIN)/python -m scripts.docs_parts --check
-	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract analysis scripts device functions stacks station local testkit bench verify docs/examples && $(BIN)/lint-imports --no-cache --no-logo && $(BIN)/npm run --silent check
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract analysis scripts device functions stacks station local testkit bench verify docs/examples && $(BIN)/lint-imports --no-cache --no-logo && PATH="$(CURDIR)/$(BIN):$$PATH" npm run --silent check
 	@$(MAKE) --no-print-directory docs
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
 
