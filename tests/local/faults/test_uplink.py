@@ -6,7 +6,6 @@ import logging
 import os
 import shutil
 import socket
-import subprocess
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import trustme
 
 from iort_agent.common.threads import SystemClock
 from iort_agent.mqtt import aws, dispatch
@@ -80,11 +80,9 @@ def paced(proxy: Proxy) -> bool:
 
 
 def self_signed(folder: Path) -> None:
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=unknown",
-         "-keyout", folder / "private.key", "-out", folder / "certificate.pem"],
-        check=True, capture_output=True,
-    )  # fmt: skip
+    unknown = trustme.CA()
+    unknown.private_key_pem.write_to_path(str(folder / "private.key"))
+    unknown.cert_pem.write_to_path(str(folder / "certificate.pem"))
 
 
 def test_the_uplink_reconnects_and_resubscribes_after_a_reset(bundle, proxy):
@@ -233,7 +231,7 @@ def test_the_uplink_connects_after_an_unknown_certificate_is_replaced(bundle, pr
 def test_an_expired_certificate_is_reported_as_expired(bundle, proxy, caplog):
     class LateClock(SystemClock):
         def now_us(self) -> int:
-            return 4_000_000_000_000_000
+            return 40_000_000_000_000_000  # the year 3237
 
     car = bundle()
     self_signed(car.folder)

@@ -39,6 +39,8 @@ def test_the_examples_import_no_code_of_the_project(example):
 def car(request, bundle, embedded, tmp_path):
     if request.param == "added":
         return bundle()
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed: apt install openssl")
     name, folder = f"foreign-{request.param}", tmp_path / "claim"
     identity.claim(embedded.cloud, name, out=folder)
     subprocess.run([sys.executable, PROVISION, folder, name], check=True, timeout=GUARD_S)
