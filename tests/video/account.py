@@ -3,13 +3,15 @@ pictures came again, and whether a command passed whose driver saw a late pictur
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 from iort_agent.control.commands import ACCEPTED
+
+S = 1_000_000
 
 
 class Shown(NamedTuple):
@@ -130,6 +132,16 @@ def longest_gap_ms(shown: Sequence[Shown], span: tuple[int, int]) -> float:
     return max(after - before for before, after in pairwise(times)) / 1000
 
 
+def struck(commands: Sequence[Motion], captured: Mapping[int, int], span: tuple[int, int]) -> dict[int, int]:
+    """The capture time of the picture at which a thread was struck, if it had no time to record it: it is on
+    the screen, and the robot's word of its age is in the commands of the time. At most one a strike."""
+    for one in commands:
+        known = one.frame is None or one.frame in captured or one.frame_age_ms is None
+        if span[0] <= one.at_us < span[1] and not known:
+            return {one.frame: one.at_us - round(one.frame_age_ms * 1000)}
+    return {}
+
+
 @dataclass(frozen=True)
 class Verdict:
     """The commands of a time: how many passed, and those that must not have passed, each with why."""
@@ -153,7 +165,8 @@ def judge(
     """Judge the commands of a time. ``last_ms`` is when the last one passed, from its begin.
 
     By the robot's word: the picture was known, and not late. By the screen, which the robot does not see: the
-    picture that the command names was on it, and the newest there was not late when the command came.
+    picture that the command names was on it, or a later one, and the newest there was not late when the
+    command came.
     ``screen_ms`` is how exactly a browser tells when a picture is on the screen, ``slack_ms`` how exactly
     a sample tells when its command came.
     """
@@ -162,6 +175,9 @@ def judge(
         if one.number is not None:
             on_screen.setdefault(one.number, one.shown_us - round(one.early_ms * 1000))
     newest = sorted((at_us, number) for number, at_us in on_screen.items())
+    # When a picture or a later one was on it: on a busy machine one is overtaken before it is read there.
+    numbers = sorted(on_screen)
+    by_us = list(accumulate((on_screen[number] for number in reversed(numbers)), min))[::-1]
     own = [one for one in commands if span[0] <= one.at_us < span[1]]
     passed = [one for one in own if one.passed]
     wrong = []
@@ -174,8 +190,10 @@ def judge(
         else:
             if one.frame_age_ms > limit_ms:
                 why.append(f"its picture was {one.frame_age_ms:.0f} ms old")
-            if on_screen.get(one.frame, 2**63) > one.at_us + screen_ms * 1000:
-                why.append(f"picture {one.frame} was not on the screen")
+            place = bisect_left(numbers, one.frame)
+            if place == len(numbers) or by_us[place] > one.at_us + screen_ms * 1000:
+                unread = sum(each.number is None and 0 <= one.at_us - each.shown_us < S for each in shown)
+                why.append(f"picture {one.frame} was not on the screen, {unread} of its second unread")
         last = bisect_right(newest, (one.at_us + round(screen_ms * 1000), 2**63)) - 1
         seen = newest[last][1] if last >= 0 else None
         age_ms = (one.at_us - captured[seen]) / 1000 if seen in captured else None

@@ -26,6 +26,7 @@ from local.figures import Spread
 from testkit.waiting import GUARD_S, InstrumentError, reached, until
 from tests.video.account import (
     Motion,
+    S,
     Said,
     Shown,
     Verdict,
@@ -37,6 +38,7 @@ from tests.video.account import (
     motions,
     said_again_s,
     said_wrong_ms,
+    struck,
 )
 from tests.video.page import Viewer
 from tests.video.scene import LEASE_S, LIMIT_MS, Receiver, Scene
@@ -348,6 +350,9 @@ class Proof:
         figures.age_wrong_ms = Spread.of(said_wrong_ms(live, self._captured))
         shown = self._shown[CHROMIUM]
         for each in figures.tries:
+            if each.failure == ENCODER:
+                span = (each.asked_us - S, each.span[1])
+                self._captured |= struck(commands, self._captured, span)
             begin_us, end_us = each.span
             seen_us = each.asked_us - _SEEN_US
             each.driven = sum(one.passed for one in commands if seen_us <= one.at_us < begin_us)

@@ -18,6 +18,7 @@ from tests.video.account import (
     motions,
     said_again_s,
     said_wrong_ms,
+    struck,
 )
 
 LIMIT_MS = 500
@@ -123,3 +124,25 @@ def test_nulls_of_a_query_are_none() -> None:
     )
     assert one == Motion(5, 3, "accepted", None, None, blind=False, drives=False)
     assert not one.passed
+
+
+def test_a_picture_that_was_overtaken_before_it_was_read_was_on_the_screen() -> None:
+    shown = [*SHOWN[:9], *SHOWN[10:]]
+    judged = judge([command(1_190_000, 10)], shown, CAPTURED, LIMIT_MS, EVER)
+    assert judged.wrong == ()
+    (told,) = judge([command(1_150_000, 10)], shown, CAPTURED, LIMIT_MS, EVER).wrong
+    assert "picture 10 was not on the screen, 0 of its second unread" in told
+    (told,) = wrong(command(2_100_000, 20)._replace(frame=21))
+    assert "picture 21 was not on the screen" in told
+
+
+def test_the_picture_of_a_strike_is_known_by_the_commands_that_name_it() -> None:
+    recorded = {number: at_us for number, at_us in CAPTURED.items() if number != 20}
+    told = [command(2_100_000, 20), command(2_200_000, 20)]
+    assert wrong(*told) == ()
+    assert len(judge(told, SHOWN, recorded, LIMIT_MS, EVER).wrong) == 2
+    assert struck(told, recorded, (1_500_000, 2_500_000)) == {20: 2_000_000}
+    assert struck(told, recorded, (2_500_000, 3_000_000)) == {}
+    assert struck(told, CAPTURED, (1_500_000, 2_500_000)) == {}
+    # Without the robot's word it is not known.
+    assert struck([told[0]._replace(frame_age_ms=None)], recorded, (1_500_000, 2_500_000)) == {}
